@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Unpack, get_args
 
 from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
-from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
+from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.escalation.climb import climb
-from colmap_affrect.escalation.escalate import escalate, matched_again
+from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
@@ -29,28 +29,21 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
-from colmap_affrect.pairs.lists import Pair, PairOptions, read_pairs
+from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import StageReport, installed_versions, sum_by_stage
+from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.advice import advice
-from colmap_affrect.report.pairs import draw_pairs_to_check
-from colmap_affrect.report.run_page import RunContent, write_run_page
-from colmap_affrect.report.run_report import (
-    RunReport,
-    cameras_of_report,
-    lines_of_report,
-)
+from colmap_affrect.report.results import MappingResult, write_results
+from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.foreign import ForeignDatabase, import_and_verify
-from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.map import image_names, unregistered
+from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.map import image_names
 from colmap_affrect.stages.map import map_images as map_pairs
 from colmap_affrect.stages.match import load_matchers
 from colmap_affrect.stages.match import match as match_pairs
@@ -518,9 +511,8 @@ def map_and_report(
     workspace = context.workspace
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
     _check_extension(extend, mapper, output_path=workspace.path, overwrite=overwrite)
-    sizes = dict[str, tuple[int, int]]()
-    for name, camera in context.graph.cameras.items():
-        sizes[name] = (camera.width, camera.height)
+    cameras = context.graph.cameras.items()
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras}
     marks = _check_by_hand(context.by_hand, names, mapper, size_of=sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
@@ -528,65 +520,15 @@ def map_and_report(
         gone, "is gone since its features were extracted; these are used"
     )
     report = replace(report, warnings={**report.warnings, **lost})
-    pair_inliers = dict[Pair, int]()
-    for pair, num_inliers in context.num_verified_inliers().items():
-        if context.by_hand.allows(*pair):
-            pair_inliers[pair] = num_inliers
-    missing = unregistered(context, names, models, pair_inliers)
-    again = matched_again(context)
-    result = RunReport(
-        output_path=workspace.path,
-        images_total=len(names),
-        unregistered=missing,
-        models=tuple(models),
-        num_verified_pairs=len(pair_inliers),
-        stages=sum_by_stage((*earlier, report)),
-        versions=installed_versions(),
-        preset=mapper.options.preset_name,
-        verification=context.verification.to_mapping(),
-        mapping=mapper.options.to_mapping(),
-        cameras=cameras_of_report(workspace, models, before),
-        extended=tuple(before),
-        advice=advice(
-            context,
-            missing,
-            models,
-            max(pair_inliers.values(), default=0),
-            again.untried,
-            again.effort,
-        ),
-        by_hand=context.by_hand.texts(),
-        effort=again.effort if again.tried or again.untried else "",
-        matched_again=again.tried,
-        untried=again.untried,
-        **_own_results(context, names),
+    result = MappingResult(
+        options=mapper.options,
+        names=names,
+        extended=before,
+        marks=marks,
+        models=models,
+        stages=(*earlier, report),
     )
-    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
-    replace_text(workspace.report, result.to_json())
-    if page:
-        content = RunContent(
-            names,
-            pair_inliers,
-            workspace.photographs(),
-            marks,
-            draw_pairs_to_check(context, result, pair_inliers),
-            context.graph.cameras,
-        )
-        write_run_page(workspace, result, content, context.progress)
-    return result
-
-
-def _own_results(context: Context, names: Sequence[str]) -> dict[str, Any]:
-    """Return the fields of a report that the database of another program has otherwise, or not."""
-    workspace = context.workspace
-    if workspace.is_foreign:
-        return {"num_pairs": num_matched_pairs(workspace.database), "recipe": ""}
-    return {
-        "num_pairs": len(context.listed_pairs()),
-        "recipe": workspace.recipe(),
-        "guided": guided_counts(context),
-        "lines": lines_of_report(context.features, names),
-    }
+    return write_results(context, result, page=page)
 
 
 def _names_and_gone(

@@ -43,12 +43,10 @@ class DepthOptions(Options):
 
     def file(self, name: str) -> Path | None:
         """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""
-        for stem in (name, splitext(name)[0]):
-            for suffix in SUFFIXES:
-                path = Path(self.path) / f"{stem}{suffix}"
-                if path.is_file():
-                    return path
-        return None
+        names = [f"{name}{suffix}" for suffix in SUFFIXES]
+        names += [f"{splitext(name)[0]}{suffix}" for suffix in SUFFIXES]
+        paths = map(Path(self.path).joinpath, names)
+        return next(filter(Path.is_file, paths), None)
 
 
 class DepthMaps:

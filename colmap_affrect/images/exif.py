@@ -192,9 +192,10 @@ def exif_focal(
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
     stated = _statements(tags, sensor_width_mm)
     if not stated:
-        lens_mm = tags.focal_mm or 0.0
         return ExifFocal(
-            focal_px=None, why="no EXIF focal length in px", lens_mm=lens_mm
+            focal_px=None,
+            why="no EXIF focal length in px",
+            lens_mm=tags.focal_mm or 0.0,
         )
     return _reconcile(tags, stated)
 
@@ -250,8 +251,9 @@ def _reconcile(tags: CameraTags, stated: Mapping[str, float]) -> ExifFocal:
     if _contradicting(plausible, plausible[key]):
         if not _may_be_whole(tags.size):
             texts = [f"{focal:.0f} px by its {k}" for k, focal in plausible.items()]
-            values = " and ".join(texts)
-            return ExifFocal(None, why=f"EXIF contradicts itself: {values}")
+            return ExifFocal(
+                focal_px=None, why=f"EXIF contradicts itself: {' and '.join(texts)}"
+            )
         key = next(each for each in plausible if each != RESOLUTION)
     focal_px = plausible[key]
     if key == RESOLUTION and tags.scale != 1.0:
@@ -268,11 +270,11 @@ def _reconcile(tags: CameraTags, stated: Mapping[str, float]) -> ExifFocal:
 def _plausible_focals(stated: Mapping[str, float], longer: int) -> dict[str, float]:
     """Return the focal lengths that a photograph of this longer side in px may have."""
     low, high = PLAUSIBLE_FOCALS
-    plausible = {}
-    for key, focal in stated.items():
-        if low * longer <= focal <= high * longer:
-            plausible[key] = focal
-    return plausible
+    return {
+        key: focal
+        for key, focal in stated.items()
+        if low * longer <= focal <= high * longer
+    }
 
 
 def _contradicting(stated: Mapping[str, float], focal_px: float) -> list[str]:

@@ -10,7 +10,8 @@ from typing import BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.reading import PNG, open_image, read_header, stand_upright
+from colmap_affrect.images.reading import PNG, open_image, read_header
+from colmap_affrect.images.tiff import stand_upright
 from colmap_affrect.project.atomic_files import replace_bytes
 
 UPRIGHT = 1  # EXIF's number

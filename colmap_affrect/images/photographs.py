@@ -213,8 +213,8 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     files = photograph_files(image_path, IMAGE_SUFFIXES)
     names = [name for name in files if not _odd(name)]
     if not names:
-        notes = left_out(image_path).items()
-        others = "".join(f"; {kind}: {what}" for kind, what in notes)
+        reasons = left_out(image_path).items()
+        others = "".join(f"; {kind}: {why}" for kind, why in reasons)
         raise OptionError(
             f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}"
         )
@@ -234,7 +234,9 @@ def require_folder(image_path: Path) -> None:
 def left_out(image_path: Path) -> dict[str, str]:
     """Return why photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
-    files, notes = _walk(image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS))
+    files, reasons = _walk(
+        image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)
+    )
     for name in sorted(files):
         suffix = _suffix(name)
         if suffix not in IMAGE_SUFFIXES:
@@ -244,7 +246,7 @@ def left_out(image_path: Path) -> dict[str, str]:
         is_tiff = suffix in TIFF_SUFFIXES
         num_pages = len(reading.pages(image_path / name)) if is_tiff else 1
         if num_pages > 1:
-            notes[name] = (
+            reasons[name] = (
                 f"has {num_pages} pages, and only the first is used; colmap-affrect convert makes "
                 "a file of each"
             )
@@ -256,8 +258,8 @@ def left_out(image_path: Path) -> dict[str, str]:
             why = "it is a video; take photographs out of it, as: ffmpeg -i it -vf fps=2 %04d.jpg"
         elif kind == "names":
             why = f"{_odd(names[0])}; rename it"
-        notes[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
-    return notes
+        reasons[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
+    return reasons
 
 
 def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
@@ -290,10 +292,9 @@ def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str,
     walk = _Walk(folder, suffixes)
     while walk.ahead or walk.linked:
         walk.enter(walk.ahead.popleft() if walk.ahead else walk.linked.popleft())
-    notes = dict[str, str]()
-    for why, names in walk.left_out.items():
-        notes[such_as(map(one_line, names))] = f"left out: {why}"
-    return walk.found, notes
+    left_out = walk.left_out.items()
+    reasons = {such_as(map(one_line, names)): f"left out: {w}" for w, names in left_out}
+    return walk.found, reasons
 
 
 class _Walk:

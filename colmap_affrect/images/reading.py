@@ -7,8 +7,6 @@ import re
 import struct
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO, TypeVar
@@ -32,6 +30,7 @@ from colmap_affrect.images.pnm import (
     with_line_end,
     with_usual_white,
 )
+from colmap_affrect.images.tiff import stand_upright
 from colmap_affrect.project.regular_files import (
     NotAFileError,
     open_regular,
@@ -270,22 +269,6 @@ FLOAT_RANGE = (-0.5, 2.0)
 NUM_TONES = 250_000  # about so many pixels are looked at
 # Along each border is passed over: scans have frames and captions there
 FRAME_FRAC = 0.1
-
-
-@dataclass(frozen=True)
-class TiffLayout:
-    """Where the tags of a TIFF are, in the letters of :mod:`struct`."""
-
-    where: int  # byte at which the offset of the first page's tags is
-    offset: str  # type of offsets
-    count: str  # type of the number of tags
-    entry_bytes: int  # length of a tag; its value is at the end
-
-
-TIFF_LAYOUT = TiffLayout(where=4, offset="I", count="H", entry_bytes=12)
-BIG_TIFF_LAYOUT = TiffLayout(where=8, offset="Q", count="Q", entry_bytes=20)
-# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits
-BIG_TIFF = 43
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )
@@ -391,9 +374,8 @@ def in_eight_bits(
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
-    return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[
-        1
-    ].tobytes()
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(".jpg", ordered, parameters)[1].tobytes()
 
 
 def decode(
@@ -477,39 +459,19 @@ def foreign_format(data: Bytes) -> str:
     return ""
 
 
-def stand_upright(data: Bytes) -> None:
-    """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say.
-
-    EXIF is laid out as a TIFF is.
-    """
-    order = {b"II": "<", b"MM": ">"}.get(data[:2].tobytes())
-    if not order:
-        return
-    content = data.data
-    with suppress(struct.error):  # damaged
-        (version,) = struct.unpack_from(f"{order}H", content, 2)
-        layout = BIG_TIFF_LAYOUT if version == BIG_TIFF else TIFF_LAYOUT
-        (start,) = struct.unpack_from(order + layout.offset, content, layout.where)
-        (count,) = struct.unpack_from(order + layout.count, content, start)
-        first = start + struct.calcsize(layout.count)
-        end = min(first + count * layout.entry_bytes, data.size)
-        for entry in range(first, end, layout.entry_bytes):
-            (tag,) = struct.unpack_from(f"{order}H", content, entry)
-            if tag == ExifTags.Base.Orientation:
-                next_entry = entry + layout.entry_bytes
-                value = next_entry - struct.calcsize(layout.offset)
-                struct.pack_into(f"{order}H", content, value, 1)
-
-
 def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
     """Shrink an (H, W) or (H, W, 3) image, by area averaging, until no side is longer."""
     height, width = image.shape[:2]
     scale = max_size_px / max(width, height)
     if scale >= 1.0:
         return image
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        cv2.resize(
+            image,
+            dsize=(max(1, round(width * scale)), max(1, round(height * scale))),
+            interpolation=cv2.INTER_AREA,
+        ),
+        dtype=np.uint8,
     )
 
 

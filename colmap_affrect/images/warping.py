@@ -25,11 +25,19 @@ def half_size(image: Singles) -> Singles:
     """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
     smooth = cv2.sepFilter2D(
-        image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101
+        image,
+        ddepth=-1,
+        kernelX=kernel,
+        kernelY=kernel,
+        borderType=cv2.BORDER_REFLECT_101,
     )
-    size = (image.shape[1] // 2, image.shape[0] // 2)
     return np.asarray(
-        cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32
+        cv2.resize(
+            smooth,
+            dsize=(image.shape[1] // 2, image.shape[0] // 2),
+            interpolation=cv2.INTER_LINEAR,
+        ),
+        dtype=np.float32,
     )
 
 
@@ -65,9 +73,12 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
     density = max(1, ceil(compression - 1e-9))
     dense_from_image = np.diag([1.0, density, 1.0]) @ matrix
     size = (width, (height - 1) * density + 1)
-    border = cv2.BORDER_REFLECT_101
     dense = cv2.warpAffine(
-        source, dense_from_image[:2], size, flags=cv2.INTER_LINEAR, borderMode=border
+        source,
+        M=dense_from_image[:2],
+        dsize=size,
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
     )
     sigma_px = _anti_aliasing_sigma(compression, density)
     if sigma_px > 0.0:
@@ -109,7 +120,13 @@ def _warp_tile(
     x, y, _ = _source_points(
         image_from_tile, columns, rows, image_size=source.shape[1::-1]
     )
-    dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    dense = cv2.remap(
+        source,
+        map1=x,
+        map2=y,
+        interpolation=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
     dense = cv2.GaussianBlur(
         dense,
         ksize=(2 * reach_x + 1, 2 * reach_y + 1),
@@ -177,10 +194,15 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
     image_from_region = np.eye(3)
     image_from_region[:2, 2] = rectification.region_origin
     if rectification.is_affine:
-        matrix = (rectification.rectified_from_image @ image_from_region)[:2]
-        size = rectification.canvas_size
+        matrix = rectification.rectified_from_image @ image_from_region
         return np.asarray(
-            cv2.warpAffine(values, matrix, size, flags=cv2.INTER_NEAREST), np.uint8
+            cv2.warpAffine(
+                values,
+                M=matrix[:2],
+                dsize=rectification.canvas_size,
+                flags=cv2.INTER_NEAREST,
+            ),
+            np.uint8,
         )
     mask = np.empty(rectification.canvas_size[::-1], dtype=np.uint8)
     region_from_image = np.linalg.inv(image_from_region)

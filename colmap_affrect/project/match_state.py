@@ -83,11 +83,12 @@ class MatchState:
 
         Of images that have gone nothing is left; others may get their names.
         """
-        backgrounds = filter(lambda known: known[0] not in images, self.backgrounds)
         return MatchState(
             stationary=self.stationary,
             still_cameras=self.still_cameras,
-            backgrounds=tuple(backgrounds),
+            backgrounds=tuple(
+                (name, cells) for name, cells in self.backgrounds if name not in images
+            ),
             effort=self.effort,
         )
 

@@ -4,18 +4,18 @@ import json
 import math
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
 NUM_WORST = 3  # tie points that a summary names
-MAX_LENSES = 3  # focal lengths in mm that a summary names
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
@@ -53,33 +53,6 @@ def probability_text(probability: float) -> str:
     return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """A source of focal lengths that a model may contradict, and what to say then."""
-
-    what: str  # that may be wrong
-    sources: tuple[str, ...]  # of a focal length, as ``report.json`` calls them
-    by: str  # what its number is known by
-    remedy: str
-
-
-# What the user gives is usually held; that of a database only has a prior.
-CONTRADICTIONS = (
-    Contradiction(
-        what="EXIF",
-        sources=("exif", "exif-rescaled"),
-        by="by EXIF",
-        remedy="--ignore-exif leaves it out",
-    ),
-    Contradiction(
-        what="the given focal length",
-        sources=("given",),
-        by="given",
-        remedy="--cameras-path takes another one",
-    ),
-)
-# Of a focal length: three standard deviations of what EXIF usually has
-MAX_EXIF_ERROR = 1.27
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (
@@ -106,82 +79,6 @@ def _some(lines: Iterable[str]) -> list[str]:
     if num_more <= 1:
         return listed
     return [*listed[:MAX_LINES], f"            and {num_more} more, see report.json"]
-
-
-def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say where a model contradicts what was known of cameras, and what would tell lenses in mm.
-
-    Args:
-        cameras: entries of ``report.json``.
-    """
-    notes = []
-    for contradiction in CONTRADICTIONS:
-        notes += _contradiction_notes(cameras, contradiction)
-    estimated = list(filter(_is_estimated, cameras))
-    num_estimates = len({camera["refined_px"] for camera in estimated})
-    if num_estimates < len(estimated):
-        notes.append(
-            f"of those not known mapping makes {num_estimates}: photographs of one size share one"
-        )
-    lenses_mm = {camera.get("lens_mm") or 0.0 for camera in cameras}
-    known_mm = sorted(filter(None, lenses_mm))
-    if known_mm:
-        texts = ", ".join(f"{mm:g}" for mm in known_mm[:MAX_LENSES])
-        notes.append(
-            f"EXIF has {texts} mm, and not the size of the sensor: --focal-mm {known_mm[0]:g} "
-            "--film-width-mm WIDTH (its longer side) tells the focal length"
-        )
-    return notes
-
-
-def _contradiction_notes(
-    cameras: Sequence[Mapping[str, Any]], contradiction: Contradiction
-) -> list[str]:
-    """Return a line where models are far from the focal lengths of some sources."""
-    sources = contradiction.sources
-    wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
-    if not wrong:
-        return []
-    known_px = wrong[0]["focal_px"]
-    estimated_px = wrong[0]["refined_px"]
-    more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-    return [
-        f"{contradiction.what} may be wrong: {known_px:.0f} px {contradiction.by}, "
-        f"{estimated_px:.0f} px in the model{more}; {contradiction.remedy}"
-    ]
-
-
-def merge_shared_cameras(
-    cameras: Sequence[Mapping[str, Any]],
-) -> list[Mapping[str, Any]]:
-    """Return cameras, with those that mapping has made one as one, with all their photographs.
-
-    Args:
-        cameras: entries of ``report.json``.
-    """
-    merged: dict[object, Mapping[str, Any]] = {}
-    for number, camera in enumerate(cameras):
-        key: object = number
-        if _is_estimated(camera):
-            key = (camera["refined_px"], camera["focal_px"], camera["why"])
-        names = camera["names"]
-        if key in merged:
-            names = [*merged[key]["names"], *names]
-        merged[key] = {**camera, "names": names}
-    return list(merged.values())
-
-
-def _is_estimated(camera: Mapping[str, Any]) -> bool:
-    """Return whether nothing but the model tells the focal length of a camera."""
-    return camera["source"] == "guess" and bool(camera.get("refined_px"))
-
-
-def _is_contradicted(camera: Mapping[str, Any], sources: Sequence[str]) -> bool:
-    """Tell whether a model is far from a focal length that is known from one of some sources."""
-    if camera["source"] not in sources or not camera.get("refined_px"):
-        return False
-    ratio = camera["refined_px"] / camera["focal_px"]
-    return not 1 / MAX_EXIF_ERROR <= ratio <= MAX_EXIF_ERROR
 
 
 def by_story(stories: Mapping[str, str]) -> list[str]:
@@ -258,9 +155,11 @@ def sum_by_stage(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     found = dict[str, StageReport]()
     for report in reports:
         before = found.get(report.name, replace(report, wall_s=0.0, num_done=0))
-        wall_s = before.wall_s + report.wall_s
-        num_done = before.num_done + report.num_done
-        found[report.name] = replace(report, wall_s=wall_s, num_done=num_done)
+        found[report.name] = replace(
+            report,
+            wall_s=before.wall_s + report.wall_s,
+            num_done=before.num_done + report.num_done,
+        )
     return tuple(found.values())
 
 
@@ -469,18 +368,16 @@ class ReconstructionReport(Summarized):
     @property
     def failures(self) -> dict[str, str]:
         """Images that could not be read, with the reason."""
-        failures = dict[str, str]()
-        for stage in self.stages:
-            failures.update(stage.failures)
-        return failures
+        return {
+            name: why for stage in self.stages for name, why in stage.failures.items()
+        }
 
     @property
     def warnings(self) -> dict[str, str]:
         """Images that were worked on in another way than asked for, with the reason."""
-        warnings = dict[str, str]()
-        for stage in self.stages:
-            warnings.update(stage.warnings)
-        return warnings
+        return {
+            name: why for stage in self.stages for name, why in stage.warnings.items()
+        }
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
@@ -572,9 +469,8 @@ class ReconstructionReport(Summarized):
         if not self.cameras:
             return []
         counts = Counter(str(camera["source"]) for camera in self.cameras)
-        texts = []
-        for source, count in counts.most_common():
-            texts.append(f"{count} {SOURCES.get(source, source)}")
+        sources = counts.most_common()
+        texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
         return [
             f"cameras     focal lengths: {', '.join(texts)}",
             *[f"            {note}" for note in camera_notes(self.cameras)],

@@ -6,9 +6,8 @@ zeros, which change no distance. Matches have the attributes ``level``, whose fe
 together with those of level 0, and ``tried``, with a bit for each level that was tried. Beside
 them a pair may have learned matches that are not in use (:class:`Learned`), and pairs that use
 learned ones have the attribute ``measured_worth``: what the best of measured frames are worth.
-``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
-image or one batch of pairs and closed again; what is written in between appears as a whole
-(:mod:`colmap_affrect.project.atomic_files`).
+Files are opened for one image or one batch of pairs and closed again; what is written in between
+appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -90,8 +89,7 @@ def _content(group: h5py.Group) -> Content:
 
 def _level_ends(group: h5py.Group) -> dict[int, int]:
     levels = read_checked(group, "levels").tolist()
-    ends = read_checked(group, "level_ends").tolist()
-    return dict(zip(levels, ends, strict=True))
+    return dict(zip(levels, read_checked(group, "level_ends").tolist(), strict=True))
 
 
 def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
@@ -186,8 +184,9 @@ class FeatureStore(GroupStore):
             known = self._features(group)
             first_id = int(known.rectification_ids.max(initial=0))
             ids = features.rectification_ids
-            numbered = np.where(ids, ids + first_id, 0)
-            added = replace(features, rectification_ids=numbered)
+            added = replace(
+                features, rectification_ids=np.where(ids, ids + first_id, 0)
+            )
             both = union(of_one_size([known, added]))
             self._write_features(
                 file,
@@ -497,11 +496,8 @@ class MatchStore(GroupStore):
         Returns:
             By pair a level, or a number with a bit for each level that was tried.
         """
-        found = dict[Names, int]()
         with self._open("r") as file:
-            for pair in pairs:
-                found[pair] = int(file[pair_key(*pair)].attrs[attribute])
-        return found
+            return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
 
     def read(self, pairs: Sequence[Names]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""
@@ -531,12 +527,11 @@ def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatc
     """Read the matches of a pair, or those whose datasets begin with a prefix."""
     matches0 = read_checked(group, f"{prefix}matches0").astype(np.int64)
     rows = np.flatnonzero(matches0 >= 0)
-    indices = np.stack([rows, matches0[rows]], axis=1)
-    scores = read_checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
+    scores = read_checked(group, f"{prefix}matching_scores0")
     return PairMatches(
         names=names,
-        indices=indices,
-        scores=scores,
+        indices=np.stack([rows, matches0[rows]], axis=1),
+        scores=scores[rows].astype(np.float32),
         num_keypoints1=len(matches0),
         level=int(group.attrs[f"{prefix}level"]),
     )
@@ -549,47 +544,3 @@ def _read_learned(group: h5py.Group, names: Names) -> Learned | None:
     return Learned(
         _read_matches(group, names, prefix=LEARNED), (num_inliers, num_consistent)
     )
-
-
-@dataclass(frozen=True)
-class GuidedPair:
-    """What guided matching found for a pair."""
-
-    names: Names  # of the two images, in the order of the columns
-    exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
-    num_inliers: int  # of the geometry that took the place of the one before; 0 where that stayed
-
-
-class GuidedStore(GroupStore):
-    """Which pairs were matched again by their geometry."""
-
-    format = "colmap_affrect/guided matches"
-    stage = "verify"
-
-    def write(self, pairs: Iterable[GuidedPair]) -> None:
-        """Write a batch of pairs, in the place of what is there of them."""
-        with self._open("a") as file:
-            for pair in pairs:
-                self._write(
-                    file,
-                    key=pair_key(*pair.names),
-                    datasets={"exact": pair.exact},
-                    names=np.asarray(pair.names, dtype=h5py.string_dtype()),
-                    num_inliers=pair.num_inliers,
-                )
-
-    def read(self) -> list[GuidedPair]:
-        """Read all pairs."""
-        if not self.path.exists():
-            return []
-        found = []
-        with self._open("r") as file:
-            for _, group in sorted(entries_of(file), key=lambda item: item[0]):
-                first, second = group.attrs["names"]
-                pair = GuidedPair(
-                    names=(str(first), str(second)),
-                    exact=read_checked(group, "exact"),
-                    num_inliers=int(group.attrs["num_inliers"]),
-                )
-                found.append(pair)
-        return found

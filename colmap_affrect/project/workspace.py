@@ -415,11 +415,8 @@ class Workspace:
             "pairs": [self.pairs],
             "extract": [self.features],
         }
-        results = list[Path]()
-        for name, paths in made.items():
-            if STAGES.index(name) >= STAGES.index(stage):
-                results += paths
-        return results
+        later = STAGES[STAGES.index(stage) :]
+        return [path for name, paths in made.items() if name in later for path in paths]
 
 
 def _may_be_ours(path: Path) -> bool:

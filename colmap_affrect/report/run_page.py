@@ -13,6 +13,7 @@ from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.camera_notes import camera_notes, merge_shared_cameras
 from colmap_affrect.project.reasons import FATES, Doubt, text_of, texts_of
 from colmap_affrect.project.report import (
     MAX_LINES,
@@ -20,8 +21,6 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     by_story,
-    camera_notes,
-    merge_shared_cameras,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace

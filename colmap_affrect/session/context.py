@@ -30,10 +30,11 @@ from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.guided_store import GuidedStore
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
-from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
+from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 from colmap_affrect.session.view_graph import ViewGraph
@@ -198,11 +199,11 @@ class Resources(Options):
     def usable_levels(self, options: ExtractionOptions) -> list[int]:
         """Return the first level, and those of escalation whose files of weights are here."""
         missing = set(self._missing_weights(options))
-        usable = []
-        for number, level in enumerate(options.levels):
-            if number == 0 or missing.isdisjoint(level.weights):
-                usable.append(number)
-        return usable
+        return [
+            number
+            for number, level in enumerate(options.levels)
+            if number == 0 or missing.isdisjoint(level.weights)
+        ]
 
     def how_to_complete(self, options: ExtractionOptions) -> str:
         """Return how to get what other levels wait for; empty if none does."""

@@ -38,17 +38,23 @@ def add_images(
     """
     start_database(workspace, inputs)
     rejected = import_images(
-        workspace.database, Path(inputs.image_path), names, inputs.cameras
+        workspace.database,
+        image_path=Path(inputs.image_path),
+        names=names,
+        options=inputs.cameras,
     )
     graph.forget()
-    initial_cameras = None
+    initial_cameras = None if inputs.from_database else inputs.initial_cameras
     known = None
     if inputs.from_database:
         original = Path(inputs.from_database)
         known = read_camera_records(original.with_name(workspace.cameras.name))
-    else:
-        initial_cameras = inputs.initial_cameras
-    record_cameras(graph.cameras, workspace.cameras, initial_cameras, known)
+    record_cameras(
+        graph.cameras,
+        records_path=workspace.cameras,
+        initial=initial_cameras,
+        known=known,
+    )
     reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
     return dict.fromkeys(rejected, reason)
 
@@ -81,9 +87,9 @@ def _write_keypoints(context: Context, names: Sequence[str]) -> None:
             ranges = store.level_ranges(name).values()
             colmap_database.write_keypoints(
                 database,
-                ids[name],
-                store.read_frames(name),
-                [part.stop for part in ranges],
+                image_id=ids[name],
+                lafs=store.read_frames(name),
+                level_ends=[part.stop for part in ranges],
             )
 
 

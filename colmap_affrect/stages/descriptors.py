@@ -116,8 +116,10 @@ def iterate_matches(
         read: returns (N, 2) keypoints and (N, D) descriptors of an image.
         options: of the matcher.
     """
-    context = MatcherContext(num_comparisons=len(pairs) * USUAL_FEATURES**2)
-    matcher = NearestNeighbors(options or NearestOptions(), context)
+    matcher = NearestNeighbors(
+        options or NearestOptions(),
+        MatcherContext(num_comparisons=len(pairs) * USUAL_FEATURES**2),
+    )
     sizes = dict[int, str]()
 
     @lru_cache(maxsize=IMAGES_IN_MEMORY)
@@ -133,9 +135,10 @@ def iterate_matches(
         return matcher.prepare(image)
 
     ordered = list(ordered_for_reuse(pairs, IMAGES_IN_MEMORY // 2))
-    tasks = ((prepared(first), prepared(second)) for first, second in ordered)
     found = map_ordered(
-        lambda both: matcher.match(*both), tasks, num_threads=available_cores()
+        lambda both: matcher.match(*both),
+        tasks=((prepared(first), prepared(second)) for first, second in ordered),
+        num_threads=available_cores(),
     )
     yield from zip(ordered, found, strict=True)
 
@@ -212,12 +215,12 @@ def unit_rows(descriptors: Floats) -> Singles:
 
 def described_images(path: Path) -> list[str]:
     """Return the sorted names of the images of a database that have descriptors."""
-    names = []
     with colmap_database.open_database(path) as database:
-        for image in database.read_all_images():
-            if database.num_descriptors_for_image(image.image_id):
-                names.append(image.name)
-    return sorted(names)
+        return sorted(
+            image.name
+            for image in database.read_all_images()
+            if database.num_descriptors_for_image(image.image_id)
+        )
 
 
 def match_database(
@@ -279,7 +282,9 @@ def _unmatched(
 def _read_arrays(database: pycolmap.Database, image_id: int, where: str) -> Arrays:
     """Return the keypoints, in pixel-centre px, and the descriptors of an image."""
     points = np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
-    values = colmap_database.read_descriptors(database, image_id, len(points), where)
+    values = colmap_database.read_descriptors(
+        database, image_id, num_keypoints=len(points), where=where
+    )
     return np.asarray(pixel_from_colmap(points)), values
 
 

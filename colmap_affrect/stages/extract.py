@@ -72,10 +72,7 @@ def extract(
     inputs.check()
     workspace.require_own(folder)
     _check_source(workspace, inputs)
-    if image_names:
-        names = checked_names(folder, names=image_names, where="image_names")
-    else:
-        names = inputs.names()
+    names = _names(inputs, image_names)
     known = {} if overwrite else context.features.contents()
     contents = inputs.contents(names, recipe.extraction, known)
     warnings = dict[str, str]()
@@ -110,6 +107,14 @@ def extract(
         failures=failures,
         warnings=warnings,
     )
+
+
+def _names(inputs: Inputs, image_names: Sequence[PathLike]) -> list[str]:
+    """Return the photographs to extract: those that are named, else those of the inputs."""
+    if not image_names:
+        return inputs.names()
+    folder = Path(inputs.image_path)
+    return checked_names(folder, names=image_names, where="image_names")
 
 
 def _check_source(workspace: Workspace, inputs: Inputs) -> None:
@@ -275,8 +280,7 @@ def _threads(extractor: ImageExtractor, images: Sequence[tuple[str, int]]) -> Th
     """Return as many threads as cores and memory allow."""
     numbers = {level for _, level in images}
     levels = [extractor.options.levels[number] for number in numbers]
-    num_at_once = one_image.num_images_at_once(levels)
-    return Threads(min(num_at_once, len(images)))
+    return Threads(min(one_image.num_images_at_once(levels), len(images)))
 
 
 def _tasks(
@@ -392,12 +396,9 @@ def _record_new_stamps(
 ) -> None:
     """Put sizes and times on record of files that hold what they did, and were written again."""
     unchanged = known.keys() & contents.keys() - set(_changed(known, contents))
-    others = dict[str, Content]()
-    for name in unchanged:
-        if known[name] != contents[name]:
-            others[name] = contents[name]
+    others = [name for name in unchanged if known[name] != contents[name]]
     if others:
-        context.features.record_contents(others)
+        context.features.record_contents({name: contents[name] for name in others})
 
 
 def _counted(names: Sequence[str], what: str) -> list[str]:

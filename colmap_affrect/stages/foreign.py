@@ -72,11 +72,12 @@ class ForeignDatabase:
     @classmethod
     def of_record(cls, record: dict[str, Any]) -> "ForeignDatabase":
         """Return it from what a run keeps of it."""
-        cameras = record.get("cameras", {})
         return cls(
             path=Path(record["database"]),
             image_path=as_path_or_none(record.get("image_path")),
-            cameras=CameraOptions.from_mapping(cameras, "config.toml"),
+            cameras=CameraOptions.from_mapping(
+                record.get("cameras", {}), "config.toml"
+            ),
             matches_path=as_path_or_none(record.get("matches")),
             match_type=record.get("match_type", "raw"),
             match_list_path=as_path_or_none(record.get("match_list")),
@@ -84,11 +85,13 @@ class ForeignDatabase:
 
     def digest(self) -> str:
         """Return a digest of all files that are given."""
-        cameras_path = as_path_or_none(self.cameras.cameras_path)
-        digests = []
-        for path in (self.path, self.matches_path, self.match_list_path, cameras_path):
-            if path:
-                digests.append(content_of(source_files(path)).digest)
+        paths = (
+            self.path,
+            self.matches_path,
+            self.match_list_path,
+            as_path_or_none(self.cameras.cameras_path),
+        )
+        digests = [content_of(source_files(path)).digest for path in paths if path]
         return digest_of(digests) if len(digests) > 1 else digests[0]
 
     def check(self) -> None:
@@ -218,10 +221,11 @@ def _write_given_matches(
     """Write the matches of a file into the copy."""
     if not foreign.matches_path:
         return
-    names = []
-    for image in database.read_all_images():
-        if database.exists_keypoints(image.image_id):
-            names.append(image.name)
+    names = [
+        image.name
+        for image in database.read_all_images()
+        if database.exists_keypoints(image.image_id)
+    ]
     with (
         given_matches(foreign.matches_path, names) as found,
         context.progress.stage("matches", len(found.pairs), "pairs") as advance,

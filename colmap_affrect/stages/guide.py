@@ -24,8 +24,9 @@ from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
+from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore, GuidedPair
+from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px
@@ -126,10 +127,13 @@ class GuidedMatcher:
         """Return the (K, 2) inliers of a pair and its guided matches."""
         descriptors1, shapes1 = self._images(task.names[0])
         descriptors2, shapes2 = self._images(task.names[1])
-        descriptors = (descriptors1, descriptors2)
-        shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
+        have_shapes = len(shapes1) and len(shapes2)
         return guided_matches(
-            descriptors, shapes, task.model, task.inliers, options=self._options
+            descriptors=(descriptors1, descriptors2),
+            shapes=(shapes1, shapes2) if have_shapes else None,
+            model=task.model,
+            inliers=task.inliers,
+            options=self._options,
         )
 
     def _read(self, name: str) -> tuple[Singles, Array]:
@@ -156,14 +160,13 @@ class Guiding:
         self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
-        self.scales = dict[str, float]()
-        for name, size in context.features.image_sizes().items():
-            self.scales[name] = max(1.0, max(size) / max_size_px)
+        sizes = context.features.image_sizes().items()
+        self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes}
         self.verifier = PairVerifier(
-            context.graph.ids,
-            context.graph.cameras,
-            context.verification,
-            extracted_px(context),
+            ids=context.graph.ids,
+            cameras=context.graph.cameras,
+            options=context.verification,
+            extracted_px=extracted_px(context),
         )
 
     def todo(self) -> tuple[list[Pair], int]:
@@ -259,13 +262,15 @@ class Guiding:
                 if not model:
                     continue
                 inliers = np.asarray(geometry.inlier_matches, np.int64)
-                task = GuidedTask(
-                    names=names,
-                    model=model.scaled(self.scales[names[0]], self.scales[names[1]]),
-                    inliers=inliers.reshape(-1, 2),
-                    is_calibrated=geometry.config == CALIBRATED,
+                scales = (self.scales[names[0]], self.scales[names[1]])
+                tasks.append(
+                    GuidedTask(
+                        names=names,
+                        model=model.scaled(*scales),
+                        inliers=inliers.reshape(-1, 2),
+                        is_calibrated=geometry.config == CALIBRATED,
+                    )
                 )
-                tasks.append(task)
         return tasks
 
     def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
@@ -276,17 +281,21 @@ class Guiding:
             if len(matches) <= len(task.inliers):
                 continue
             first, second = task.names
-            frames = (features.read_frames(first), features.read_frames(second))
-            geometry = self.verifier.geometry(task.names, frames, matches)
+            geometry = self.verifier.geometry(
+                task.names,
+                frames=(features.read_frames(first), features.read_frames(second)),
+                indices=matches,
+            )
             if _is_better(geometry, task):
                 geometries[task.names] = geometry
         pairs = []
         for task, _ in found:
             better = geometries.get(task.names)
-            num_inliers = len(better.inlier_matches) if better else 0
             pairs.append(
                 GuidedPair(
-                    names=task.names, exact=task.inliers, num_inliers=num_inliers
+                    names=task.names,
+                    exact=task.inliers,
+                    num_inliers=len(better.inlier_matches) if better else 0,
                 )
             )
         self.context.guided.write(pairs)

@@ -164,14 +164,13 @@ class ImageExtractor:
         keep = is_inside(features.keypoints, original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
-        kept = features.select(keep)
-        lines = lines_of(photograph.gray, photograph.mask) if with_lines else None
+
         return ExtractedImage(
-            features=kept,
+            features=features.select(keep),
             image_size=original_size,
             warning=warning,
             stretched=photograph.stretched,
-            lines=lines,
+            lines=lines_of(photograph.gray, photograph.mask) if with_lines else None,
         )
 
     def photograph(
@@ -311,8 +310,9 @@ def prepare(
             keys.update(part.weights)
     weights = resolve(sorted(keys), resources.weights_path, progress=progress)
     uses_network = any(level.uses_networks for level in options.levels)
-    device = resources.require_device(uses_network=uses_network)
-    network = NetworkContext(weights, device)
+    network = NetworkContext(
+        weights, resources.require_device(uses_network=uses_network)
+    )
     extractor_of = cache(lambda features: EXTRACTORS.make(features, network))
     extractors = {k: extractor_of(level.features) for k, level in levels.items()}
     depth = None

@@ -82,8 +82,11 @@ def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) 
     if len(names) > MANY_IMAGES:
         logger.warning(MANY_PAIRS, len(names), num_pairs)
     workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
-    every = combinations(names, 2)  # too many to keep in memory
-    lists.write_pairs(workspace.pairs, pairs=every, names=names)
+    lists.write_pairs(
+        workspace.pairs,
+        pairs=combinations(names, 2),  # too many to keep in memory
+        names=names,
+    )
     workspace.record_input_digests(pairs="")
     return num_pairs
 
@@ -102,15 +105,16 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
             options.num_neighbors,
             options.max_distance_m,
         )
-        by_gps = set(filter(known.issuperset, near))
+        by_gps = {pair for pair in near if known.issuperset(pair)}
         _warn_of_images_without_neighbors(context, names, pairs=by_gps, options=options)
         pairs |= by_gps
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
-        folder = Path(context.inputs.image_path)
         listed = lists.read_pairs(
-            Path(options.match_list_path), names=sorted(named), image_path=folder
+            Path(options.match_list_path),
+            names=sorted(named),
+            image_path=Path(context.inputs.image_path),
         )
         pairs.update(filter(known.issuperset, listed))
     return pairs
@@ -149,10 +153,14 @@ def _similar_pairs(
     are_paired = set[str]().union(*there).issuperset(names)
     if len(names) < 2 or are_paired or "retrieval" not in options.methods:
         return set()
-    pairs = retrieved_pairs(
-        names, features.read, num_neighbors=options.num_neighbors, progress=progress
+    return set(
+        retrieved_pairs(
+            names,
+            features.read,
+            num_neighbors=options.num_neighbors,
+            progress=progress,
+        )
     )
-    return set(pairs)
 
 
 def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:

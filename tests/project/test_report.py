@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from colmap_affrect.project.camera_notes import merge_shared_cameras
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
@@ -14,7 +15,6 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     StageReport,
-    merge_shared_cameras,
 )
 
 LARGE = ModelSummary(
