@@ -259,12 +259,11 @@ def extract(
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
-        options: options to begin with; None for the usual ones. Those of later stages are kept
-            for these.
+        options: see :func:`run`; those of later stages are kept for these.
         executor: see :func:`run`.
         overwrite: discard results that are there.
         progress: see :func:`run`.
-        keywords: fields of :class:`RunOptions`, see :func:`run`.
+        keywords: see :func:`run`.
 
     Returns:
         How many images were extracted, and why others were not.

@@ -519,10 +519,12 @@ def encode_mask(mask: Mask) -> bytes:
 
 def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
-    values = mask.astype(np.uint8)
-    return np.asarray(
-        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    resized = cv2.resize(
+        mask.astype(np.uint8),
+        dsize=size,
+        interpolation=cv2.INTER_NEAREST_EXACT,
     )
+    return np.asarray(resized > 0)
 
 
 def grow_mask(mask: Mask, num_px: int) -> Mask:

@@ -72,11 +72,10 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
     compression = 1.0 / float(np.hypot(*matrix[1, :2]))
     density = max(1, ceil(compression - 1e-9))
     dense_from_image = np.diag([1.0, density, 1.0]) @ matrix
-    size = (width, (height - 1) * density + 1)
     dense = cv2.warpAffine(
         source,
         M=dense_from_image[:2],
-        dsize=size,
+        dsize=(width, (height - 1) * density + 1),
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REFLECT_101,
     )
@@ -215,7 +214,11 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
             image_size=region.shape[::-1],
         )
         inside = cv2.remap(
-            values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            values,
+            map1=x,
+            map2=y,
+            interpolation=cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
         )
         tile[:] = np.where(ahead, inside, 0)
     return mask

@@ -55,8 +55,10 @@ def add_images(
         initial=initial_cameras,
         known=known,
     )
-    reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
-    return dict.fromkeys(rejected, reason)
+    return dict.fromkeys(
+        rejected,
+        f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})",
+    )
 
 
 def write_images_and_keypoints(context: Context) -> dict[str, str]:

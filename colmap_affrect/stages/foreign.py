@@ -109,8 +109,10 @@ class ForeignDatabase:
 
     def initial_cameras(self) -> InitialCameras:
         """Return the cameras that the user gives."""
-        options = self.cameras.changed(ignore_exif=True)
-        return InitialCameras(self.image_path or self.path.parent, options)
+        return InitialCameras(
+            self.image_path or self.path.parent,
+            self.cameras.changed(ignore_exif=True),
+        )
 
 
 def import_and_verify(
