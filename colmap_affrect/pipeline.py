@@ -36,8 +36,8 @@ from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.results import MappingResult, write_results
 from colmap_affrect.report.run_report import RunReport
+from colmap_affrect.report.run_results import MappingResult, write_results
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features

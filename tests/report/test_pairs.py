@@ -120,7 +120,7 @@ class Stores(SimpleNamespace):
         ]
         super().__init__(
             workspace=SimpleNamespace(
-                sparse=folder / "sparse", begun=begun, is_changed=False
+                sparse=folder / "sparse", started_stages=begun, is_changed=False
             ),
             extraction=SimpleNamespace(levels=levels),
             counts=num_keypoints(folder / "database.db"),
