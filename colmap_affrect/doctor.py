@@ -350,7 +350,7 @@ class _OutputFolder:
             summary = self.read(folder, partial(read_summary, folder))
             if summary:
                 counts.append(str(len(summary.registered_names)))
-        if workspace.lacks_models() and workspace.mapped:
+        if workspace.lacks_models() and workspace.mapping_record:
             advice = f"{SAME_RUN}: maps again"
             self.diagnosis.add("error", workspace.sparse, "models are gone", advice)
         listed = ", ".join(counts) or "no"
@@ -360,7 +360,7 @@ class _OutputFolder:
 def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
     """Return the stages that have begun, after all options on record have been read."""
     workspace = context.workspace
-    done = context.workspace.begun
+    done = context.workspace.started_stages
     if "extract" in done:
         _ = context.inputs, context.extraction
     _ = context.pairing, context.matching, context.verification, context.escalation

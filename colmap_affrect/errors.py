@@ -42,9 +42,8 @@ NO_MEMORY = (
 
 def lacks_memory(error: BaseException) -> bool:
     """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
-    return isinstance(error, MemoryError) or any(
-        t in str(error).lower() for t in NO_MEMORY
-    )
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY)
 
 
 ARGUMENTS = {
@@ -61,9 +60,8 @@ ARGUMENTS = {
     "tie-points": "by_hand.tie_points_path", "weights": "resources.weights_path",
 }  # fmt: skip
 """What functions call the flags whose argument has another name; a dot leads to a field."""
-FLAG = re.compile(
-    r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)"
-)  # not of a command
+# A command, whose flags stay, or a flag outside of one
+FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")
 
 
 class AffrectError(Exception):
@@ -136,7 +134,16 @@ class PartError(AffrectError):
 def damage(
     path: Path, mend: str, error_class: type[AffrectError] = StoreError
 ) -> Iterator[None]:
-    """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
+    """Say of a file that cannot be read in one line that it is damaged, and what mends it.
+
+    Args:
+        path: of the file that the block reads.
+        mend: what to do, the end of the line.
+        error_class: that is raised.
+
+    Raises:
+        AffrectError: of this class, where the block raises what readers of damaged files raise.
+    """
     try:
         yield
     except AffrectError:
@@ -159,7 +166,7 @@ def reason(error: BaseException) -> str:
     return one_line(" ".join(text.split()))[:MAX_REASON] or type(error).__name__
 
 
-def made_again(stage: str, folder: Path) -> str:
+def how_to_make_again(stage: str, folder: Path) -> str:
     """Say how what a stage has left in an output folder is made again."""
     if stage == "extract":
         return (
@@ -262,9 +269,8 @@ def heedless_stream(descriptor: int, encoding: str, *, closes: bool) -> TextIO:
 
 def say(line: str) -> None:
     """Print a line on stderr, which nobody may read any more."""
-    with suppress(
-        OSError, RuntimeError
-    ):  # the latter of a handler that a signal calls meanwhile
+    # RuntimeError is of a handler that a signal calls meanwhile.
+    with suppress(OSError, RuntimeError):
         if sys.stderr:  # it may have been closed
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()

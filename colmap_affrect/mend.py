@@ -1,8 +1,10 @@
 """Mend: a database that other programs have changed is made again from what it was made from.
 
-The stores, or the database that was copied, are what is true. Each command leaves a seal beside
-``database.db``: a digest of its rows, and size and times of the file, which is not read while it
-has these. While a command works there is no seal, so that a killed one leaves none.
+The stores, or the database that was copied, are what is true. Each command leaves a *seal*, the
+text file ``database.db.seal`` beside ``database.db``. It has a digest of the rows of the database,
+and size and times of its file: while these stay, the rows need not be read. A database whose rows
+have another digest was changed by another program. While a command works there is no seal, so that
+a killed one leaves none.
 """
 
 import logging
@@ -26,7 +28,7 @@ from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
-from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
+from colmap_affrect.stages.foreign import ForeignDatabase, import_and_verify
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.verify import update_verified, verify_matches
 
@@ -36,7 +38,7 @@ CHANGED = "was changed since the last run"
 
 
 @contextmanager
-def watched(
+def mend_and_seal(
     context: Context,
     *,
     follows: bool = True,
@@ -45,30 +47,33 @@ def watched(
 ) -> Iterator[None]:
     """Mend the database before a command works in a folder, keep it open, and seal it in the end.
 
-    ``follows``: bring it up to the last stage that was run; else the command does that. A command
-    that only ``maps`` takes a changed one as it is, with a warning; one that ``discards`` all there
-    is needs nothing mended. A database of the user is refused where COLMAP could not use it.
+    A database of the user is refused where COLMAP could not use it.
+
+    Args:
+        context: of the folder.
+        follows: bring the database up to the last stage that was run; else the command does that.
+        maps: the command only maps, and takes a changed database as it is, with a warning.
+        discards: the command discards all there is, so that nothing need be mended.
+
+    Raises:
+        DatabaseError: the database cannot be used, and cannot be made again.
     """
     workspace = context.workspace
-    path = context.workspace.database
+    path = workspace.database
     if workspace.users_database:
-        if path.exists() and path.stat().st_size:
-            refuse_unusable(path, FATAL_BEFORE_MAPPING)
+        _check_users_database(path)
         yield
         return
     why = "" if discards else _why_lost(workspace)
     if maps and why == CHANGED:
-        refuse_unusable(path, FATAL_AS_IT_IS)
-        logger.warning("%s: %s, and is mapped as it is", path, CHANGED)
-        workspace.is_changed = True
-        record_cameras(context.graph.cameras, workspace.cameras)
+        _take_as_it_is(context)
         yield  # the seal stays: other commands make the database again
         return
     if why:
         _make_again(context, why, follows=follows)
     workspace.seal.unlink(missing_ok=True)
     try:
-        with context.graph.kept_open():
+        with context.graph.keep_open():
             yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
@@ -77,24 +82,39 @@ def watched(
     _seal(context)
 
 
+def _check_users_database(path: Path) -> None:
+    if path.exists() and path.stat().st_size:
+        refuse_unusable(path, FATAL_BEFORE_MAPPING)
+
+
+def _take_as_it_is(context: Context) -> None:
+    """Have a database mapped that another program has changed."""
+    workspace = context.workspace
+    refuse_unusable(workspace.database, FATAL_AS_IT_IS)
+    logger.warning("%s: %s, and is mapped as it is", workspace.database, CHANGED)
+    workspace.is_changed = True
+    record_cameras(context.graph.cameras, workspace.cameras)
+
+
 def _seal(context: Context) -> None:
+    """Write the digest and the stamp of the database beside it."""
     workspace = context.workspace
     path = workspace.database
-    if path.exists() and workspace.begun:
-        with suppress(
-            AffrectError
-        ):  # one that is not sealed is looked through next time
+    if path.exists() and workspace.started_stages:
+        # One that is not sealed is looked through next time.
+        with suppress(AffrectError):
             replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
 
 
 def _stamp(path: Path) -> str:
-    return stamp_of(database_files(path)[:2])  # and its write-ahead log
+    """Return size and times of a database and of its write-ahead log."""
+    return stamp_of(database_files(path)[:2])
 
 
 def _why_lost(workspace: Workspace) -> str:
     """Say why the database is not what the last command left, empty if it is."""
     path = workspace.database
-    begun = workspace.begun
+    begun = workspace.started_stages
     if not path.exists():
         return "is missing" if "verify" in begun else ""
     sealed = list[str]()
@@ -103,13 +123,13 @@ def _why_lost(workspace: Workspace) -> str:
     if not begun or _stamp(path) in sealed:
         return ""
     try:
-        if fault := damage_of(path):  # of an index perhaps, which rows do not show
+        fault = damage_of(path)  # of an index perhaps, which rows do not show
+        if fault:
             return f"cannot be used ({fault})"
         if sealed:
             return "" if rows_digest(path) in sealed else CHANGED
-        refuse_unusable(
-            path, FATAL_AS_IT_IS
-        )  # a command was killed, and what it wrote is good
+        # A command was killed: is what it wrote good?
+        refuse_unusable(path, FATAL_AS_IT_IS)
     except AffrectError as error:
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
         return CHANGED if sealed else f"cannot be used ({reason})"
@@ -117,18 +137,17 @@ def _why_lost(workspace: Workspace) -> str:
 
 
 def _make_again(context: Context, why: str, *, follows: bool) -> None:
+    """Put a database aside, and make it again from what it was made from."""
     workspace = context.workspace
-    begun = context.workspace.begun
+    begun = workspace.started_stages
     foreign = None
+    source = f"{workspace.features.name} and {workspace.matches.name}"
     if workspace.is_foreign:
         foreign = ForeignDatabase.of_record(workspace.require("copy"))
-    source = (
-        foreign.path
-        if foreign
-        else f"{workspace.features.name} and {workspace.matches.name}"
-    )
+        source = str(foreign.path)
     hint = ""
-    if kept := _put_aside(workspace.database):
+    kept = _put_aside(workspace.database)
+    if kept:
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"
     logger.warning(
@@ -139,11 +158,11 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
     if not (follows and "verify" in begun):
         return
     if foreign:
-        copy_verified(context, foreign, context.verification)
+        import_and_verify(context, foreign, context.verification)
         return
     verify_matches(context)
     if "escalate" in begun:
-        update_verified(context, context.listed_pairs(), replaces=True)
+        update_verified(context, pairs=context.listed_pairs(), replaces=True)
     if "guide" in begun:
         guide(context)
 
@@ -152,8 +171,10 @@ def _put_aside(path: Path) -> Path | None:
     """Rename a database that others have changed, and return its new name, None if it is gone."""
     if not path.exists():
         return None
-    names = (f"database.changed{number or ''}.db" for number in count())
-    kept = next(new for name in names if not (new := path.with_name(name)).exists())
+    kept = path.with_name("database.changed.db")
+    numbers = count(1)
+    while kept.exists():
+        kept = path.with_name(f"database.changed{next(numbers)}.db")
     for file, target in zip(database_files(path), database_files(kept), strict=True):
         if file.exists():
             file.replace(target)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Unpack, get_args
 
 from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
-from colmap_affrect.colmap.database import fill_descriptors, num_matched_pairs
+from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.escalation.climb import climb
-from colmap_affrect.escalation.escalate import escalate, matched_again
+from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
@@ -26,31 +26,24 @@ from colmap_affrect.mappers.existing import (
     read_to_extend,
 )
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.mend import watched
+from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import StageReport, installed_versions, summed
+from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.advice import advice
-from colmap_affrect.report.pairs import draw_pairs_to_check
-from colmap_affrect.report.run_page import RunContent, write_run_page
-from colmap_affrect.report.run_report import (
-    RunReport,
-    cameras_of_report,
-    lines_of_report,
-)
+from colmap_affrect.report.run_report import RunReport
+from colmap_affrect.report.run_results import MappingResult, write_results
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
-from colmap_affrect.stages.foreign import ForeignDatabase, copy_verified
-from colmap_affrect.stages.guide import guide, guided_counts
-from colmap_affrect.stages.map import image_names, unregistered
+from colmap_affrect.stages.foreign import ForeignDatabase, import_and_verify
+from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.map import image_names
 from colmap_affrect.stages.map import map_images as map_pairs
 from colmap_affrect.stages.match import load_matchers
 from colmap_affrect.stages.match import match as match_pairs
@@ -119,20 +112,27 @@ def _run(
     mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    _check_extension(options.extend, mapper, workspace.path, overwrite=overwrite)
-    _check_by_hand(
-        options.by_hand, names, mapper, lambda name: header_size(image_path / name)
+    _check_extension(
+        options.extend, mapper, output_path=workspace.path, overwrite=overwrite
     )
-    forecast = Forecast(len(names), _num_pairs(names, options.pairs, image_path))
+    _check_by_hand(
+        options.by_hand,
+        names,
+        mapper,
+        size_of=lambda name: header_size(image_path / name),
+    )
+    forecast = Forecast(
+        len(names), _num_pairs(names, options=options.pairs, image_path=image_path)
+    )
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     if options.extend:
         existing_names(options.extend.model_path, names)
     recipe.extraction.check_depth()
     weights_path = options.resources.weights_path
     resolve(recipe.required_weights, weights_path, progress=context.progress)
-    load_matchers(context, recipe.extraction, recipe.matching)
+    load_matchers(context, recipe.extraction, options=recipe.matching)
     later = options.later_stages()
-    with workspace.locked(), watched(context, follows=False, discards=overwrite):
+    with workspace.locked(), mend_and_seal(context, follows=False, discards=overwrite):
         reports = [
             extract_features(context, inputs, recipe, later=later, overwrite=overwrite),
             list_pairs(context, options.pairs),
@@ -198,12 +198,22 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
 def one_stage(
     name: str, context: Context, *, overwrite: bool = False
 ) -> Iterator[Context]:
-    """Lock the folder of a context for one stage, and bring its database up to date before."""
+    """Lock the folder of a context for one stage, and bring its database up to date before.
+
+    Args:
+        name: of the stage.
+        context: of the folder.
+        overwrite: the stage discards what is there.
+    """
     is_first = name == "extract"
-    discards = is_first and overwrite
     with (
         context.workspace.locked(),
-        watched(context, follows=not is_first, maps=name == "map", discards=discards),
+        mend_and_seal(
+            context,
+            follows=not is_first,
+            maps=name == "map",
+            discards=is_first and overwrite,
+        ),
     ):
         yield context
 
@@ -225,10 +235,10 @@ def _context(
         wanted = "give the output folder of a run; map_database and verify_matches take databases"
         raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
     return Context(
-        Workspace(path),
-        Resources.given(resources, "resources"),
-        executor,
-        Progress.given(progress),
+        workspace=Workspace(path),
+        resources=Resources.given(resources, "resources"),
+        executor=executor,
+        progress=Progress.given(progress),
         by_hand=ByHand.given(by_hand, "by_hand"),
     )
 
@@ -246,7 +256,14 @@ def extract(
 ) -> StageReport:
     """Extract features into ``features.h5``, cameras and keypoints into ``database.db``.
 
-    Arguments are those of :func:`run`; options of later stages are kept for these.
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        output_path: folder for all results, made if missing.
+        options: see :func:`run`; those of later stages are kept for these.
+        executor: see :func:`run`.
+        overwrite: discard results that are there.
+        progress: see :func:`run`.
+        keywords: see :func:`run`.
 
     Returns:
         How many images were extracted, and why others were not.
@@ -310,7 +327,7 @@ def match(
     matcher = None if matching is None else MATCHERS.options(matching, "matching")
     context = _context(output_path, progress, resources, executor)
     with one_stage("match", context):
-        return match_pairs(context, matcher, overwrite=overwrite)
+        return match_pairs(context, options=matcher, overwrite=overwrite)
 
 
 def verify(
@@ -366,7 +383,7 @@ def map_images(
     with one_stage("map", _context(output_path, progress, by_hand=by_hand)) as context:
         mapper = chosen or MAPPERS.make(context.mapping)
         return map_and_report(
-            context, mapper, extension, overwrite=overwrite, page=page
+            context, mapper, extend=extension, overwrite=overwrite, page=page
         )
 
 
@@ -413,24 +430,28 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     """
     require_bools(overwrite=overwrite, page=page)
     foreign = ForeignDatabase(
-        as_path(database_path, "database_path"),
-        as_path_or_none(image_path, "image_path"),
-        CameraOptions.given(cameras, "cameras"),
-        as_path_or_none(matches_path, "matches_path"),
-        match_type,
-        as_path_or_none(match_list_path, "match_list_path"),
+        path=as_path(database_path, "database_path"),
+        image_path=as_path_or_none(image_path, "image_path"),
+        cameras=CameraOptions.given(cameras, "cameras"),
+        matches_path=as_path_or_none(matches_path, "matches_path"),
+        match_type=match_type,
+        match_list_path=as_path_or_none(match_list_path, "match_list_path"),
     )
     context = _context(output_path, progress, by_hand=by_hand)
     mapper = _mapper_of(mapping)
     chosen = VerificationOptions.given(verification, "verification")
     extension = as_extension(extend)
-    _check_foreign(context, foreign, mapper, extension, overwrite=overwrite)
+    _check_foreign(context, foreign, mapper, extend=extension, overwrite=overwrite)
     with (
         context.workspace.locked(),
-        watched(context, follows=False, discards=overwrite),
+        mend_and_seal(context, follows=False, discards=overwrite),
     ):
-        report = copy_verified(context, foreign, chosen, overwrite=overwrite)
-        return map_and_report(context, mapper, extension, earlier=[report], page=page)
+        report = import_and_verify(
+            context, foreign, verification=chosen, overwrite=overwrite
+        )
+        return map_and_report(
+            context, mapper, extend=extension, earlier=[report], page=page
+        )
 
 
 def _mapper_of(mapping: MapperOptions | Mapping[str, Any] | str | None) -> Mapper:
@@ -449,11 +470,18 @@ def _check_foreign(
     if foreign.match_type not in get_args(MatchType):
         raise OptionError(f"match_type={foreign.match_type!r}: give 'raw' or 'inliers'")
     schema_version(foreign.path)
-    _check_extension(extend, mapper, context.workspace.path, overwrite=overwrite)
+    _check_extension(
+        extend, mapper, output_path=context.workspace.path, overwrite=overwrite
+    )
     if extend:
         read_to_extend(extend.model_path)
     sizes = read_sizes(foreign.path)
-    _check_by_hand(context.by_hand, read_names(foreign.path), mapper, sizes.get)
+    _check_by_hand(
+        context.by_hand,
+        names=read_names(foreign.path),
+        mapper=mapper,
+        size_of=sizes.get,
+    )
     foreign.check()
 
 
@@ -466,64 +494,40 @@ def map_and_report(
     overwrite: bool = False,
     page: bool = True,
 ) -> RunReport:
-    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
+    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``.
+
+    Args:
+        context: of the workspace, whose pairs are verified.
+        mapper: that makes the models.
+        extend: a model that the images are registered into.
+        earlier: what the stages before have done in this run.
+        overwrite: discard the models that are there.
+        page: also write ``report.html``.
+
+    Returns:
+        The report that is also written to ``report.json``.
+    """
     workspace = context.workspace
-    options = mapper.options
     names, gone = _names_and_gone(context, may_be_gone=bool(earlier))
-    _check_extension(extend, mapper, workspace.path, overwrite=overwrite)
-    sizes = {
-        name: (one.width, one.height) for name, one in context.graph.cameras.items()
-    }
-    marks = _check_by_hand(context.by_hand, names, mapper, sizes.get)
+    _check_extension(extend, mapper, output_path=workspace.path, overwrite=overwrite)
+    cameras = context.graph.cameras.items()
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras}
+    marks = _check_by_hand(context.by_hand, names, mapper, size_of=sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
     lost = dict.fromkeys(
         gone, "is gone since its features were extracted; these are used"
     )
     report = replace(report, warnings={**report.warnings, **lost})
-    copied = workspace.is_foreign
-    verified = context.num_verified_inliers()
-    pair_inliers = {
-        pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)
-    }
-    missing = unregistered(context, names, models, pair_inliers)
-    again = matched_again(context)
-    strongest = max(pair_inliers.values(), default=0)
-    result = RunReport(
-        output_path=workspace.path,
-        images_total=len(names),
-        unregistered=missing,
-        models=tuple(models),
-        num_pairs=num_matched_pairs(workspace.database)
-        if copied
-        else len(context.listed_pairs()),
-        num_verified_pairs=len(pair_inliers),
-        stages=summed((*earlier, report)),
-        recipe="" if copied else workspace.recipe(),
-        versions=installed_versions(),
-        preset=options.preset_name,
-        verification=context.verification.to_mapping(),
-        mapping=options.to_mapping(),
-        guided={} if copied else guided_counts(context),
-        cameras=cameras_of_report(workspace, models, before),
-        lines={} if copied else lines_of_report(context.features, names),
-        extended=tuple(before),
-        advice=advice(context, missing, models, strongest, again.untried, again.effort),
-        by_hand=context.by_hand.texts(),
-        effort=again.effort if again.tried or again.untried else "",
-        matched_again=again.tried,
-        untried=again.untried,
+    result = MappingResult(
+        options=mapper.options,
+        names=names,
+        extended=before,
+        marks=marks,
+        models=models,
+        stages=(*earlier, report),
     )
-    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
-    replace_text(workspace.report, result.to_json())
-    if page:
-        pictures = draw_pairs_to_check(context, result, pair_inliers)
-        cameras = context.graph.cameras
-        content = RunContent(
-            names, pair_inliers, workspace.photographs(), marks, pictures, cameras
-        )
-        write_run_page(workspace, result, content, context.progress)
-    return result
+    return write_results(context, result, page=page)
 
 
 def _names_and_gone(

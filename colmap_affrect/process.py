@@ -40,17 +40,32 @@ ENDED = b"e"
 def run_command() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
     _open_standard_streams()
-    os.umask(
-        os.umask(0) & 0o077
-    )  # of one that takes rights from the owner, results are lost
-    if (
-        sys.platform != "linux"
-    ):  # elsewhere libraries of the system do not survive a fork
+    # Results would be lost with a mask that takes rights from the owner.
+    os.umask(os.umask(0) & 0o077)
+    if sys.platform != "linux":
+        # Elsewhere libraries of the system do not survive a fork.
         _work()
+    parent = os.getpid()
+    # Else nobody could wait for the worker.
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    messages = _Messages()
+    try:
+        worker = os.fork()
+    except OSError:  # too many processes
+        _work()
+    if not worker:
+        end_with(parent)
+        _work_and_tell(messages)
+    sys.exit(_wait_for(worker, messages))
+
+
+def _wait_for(worker: int, messages: "_Messages") -> int:
+    """Pass signals on to a worker until it has ended, and return the exit code of the command."""
     signals: list[int] = []
 
     def stop(number: int, _: object) -> None:
-        if BEGUN not in news.heard():
+        if BEGUN not in messages.read():
             _kill(worker, signal.SIGKILL)
         elif signals:
             _kill(worker, signal.SIGINT)
@@ -59,53 +74,36 @@ def run_command() -> NoReturn:
             _kill(worker, signal.SIGTERM)
         signals.append(number)
 
-    parent = os.getpid()
-    signal.signal(
-        signal.SIGCHLD, signal.SIG_DFL
-    )  # else nobody could wait for the worker
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    news = _News()
-    try:
-        worker = os.fork()
-    except OSError:  # too many processes
-        _work()
-    if not worker:
-        end_with(parent)
-        _work_and_tell(news)
     signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
     _handle(stop)
     _, status = os.waitpid(worker, 0)
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     code = os.waitstatus_to_exitcode(status)
-    if (
-        code > 0
-        and code != EXIT_INTERRUPTED
-        and not signals
-        and ENDED not in news.heard()
-    ):
+    has_failed = code > 0 and code != EXIT_INTERRUPTED
+    if has_failed and not signals and ENDED not in messages.read():
         say(
             f"error: native code ended the command with exit code {code}{WITHOUT_MEMORY}; {KEPT}"
         )
-    sys.exit(_exit_code(code, signals))
+    return _exit_code(code, signals)
 
 
-class _News:
+class _Messages:
     """What the worker tells its parent, a byte each."""
 
     def __init__(self) -> None:
         self._out, self._in = os.pipe()
         os.set_blocking(self._out, False)
-        self._heard = b""
+        self._received = b""
 
-    def tell(self, what: bytes) -> None:
-        os.write(self._in, what)
+    def write(self, message: bytes) -> None:
+        os.write(self._in, message)
 
-    def heard(self) -> bytes:
+    def read(self) -> bytes:
         """Return all that has been told until now."""
         with suppress(BlockingIOError):  # nothing new
-            self._heard += os.read(self._out, 2)
-        return self._heard
+            self._received += os.read(self._out, 2)
+        return self._received
 
 
 def _open_standard_streams() -> None:
@@ -148,12 +146,12 @@ def _exit_code(code: int, signals: list[int]) -> int:
     return 1
 
 
-def _work_and_tell(news: _News) -> NoReturn:
+def _work_and_tell(messages: _Messages) -> NoReturn:
     """Run the command line, and tell when it ends, as native code that ends it does not."""
     try:
-        _work(lambda: news.tell(BEGUN))
+        _work(lambda: messages.write(BEGUN))
     finally:
-        news.tell(ENDED)
+        messages.write(ENDED)
 
 
 def _leave(*_: object) -> NoReturn:
@@ -170,8 +168,16 @@ class _Interrupts:
     def __init__(self) -> None:
         self.signals: list[int] = []
 
-    def take(self, number: int, _: object) -> None:
-        """Handle a signal."""
+    def raise_first(self, number: int, _: object) -> None:
+        """Handle a signal.
+
+        Args:
+            number: of the signal.
+            _: the frame that it interrupted.
+
+        Raises:
+            KeyboardInterrupt: it is the first one.
+        """
         if number == signal.SIGTERM and self.signals:
             return  # of the first process, for a Ctrl-C that came here, too
         if self.signals:
@@ -193,7 +199,7 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     def begin() -> None:
         if tell_begin:
             tell_begin()
-        _handle(interrupts.take)
+        _handle(interrupts.raise_first)
 
     for stream in (sys.stdout, sys.stderr):
         escape_what_lacks(stream)
@@ -225,9 +231,8 @@ def _end(code: int | str | None) -> NoReturn:
         if sys.stdout:  # it may have been closed
             sys.stdout.flush()
     except OSError as error:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # Python flushes it again
+        # Python flushes it again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not code and not isinstance(error, BrokenPipeError):
             say(f"error: what the command prints cannot be written ({error.strerror})")
             code = 1

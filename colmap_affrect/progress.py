@@ -32,18 +32,26 @@ class Forecast:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take what is ahead if all images are new."""
-        units = {"extract": num_images, "match": num_pairs, "verify": num_pairs}
-        units["map"] = (
-            num_images + num_images**2 // 50
-        )  # adjustments grow with the model
+        # Of the stages that are ahead
         self._costs = {
-            name: COSTS[name] * count for name, count in units.items()
-        }  # ahead
-        self._cost = self._start_s = 0.0  # of the stage that runs
+            "extract": COSTS["extract"] * num_images,
+            "match": COSTS["match"] * num_pairs,
+            "verify": COSTS["verify"] * num_pairs,
+            # Adjustments grow with the model.
+            "map": COSTS["map"] * (num_images + num_images**2 // 50),
+        }
+        # Of the stage that runs
+        self._cost = 0.0
+        self._start_s = 0.0
         self._clock = clock
 
     def begin(self, name: str, total: int) -> None:
-        """A stage begins with so many units."""
+        """Take note that a stage begins.
+
+        Args:
+            name: of the stage.
+            total: images or pairs that it will work on.
+        """
         is_known = self._costs.pop(name, None) is not None
         self._cost = is_known * COSTS.get(name, 0.0) * total
         self._start_s = self._clock()
@@ -56,10 +64,9 @@ class Forecast:
         elapsed_s = self._clock() - self._start_s
         if not (frac and self._cost and self._costs) or elapsed_s < MIN_ELAPSED_S:
             return ""
-        left = (1 - frac) + sum(
-            self._costs.values()
-        ) / self._cost  # in units of this stage
-        minutes = elapsed_s / frac * left / 60
+        # In units of this stage
+        remaining = (1 - frac) + sum(self._costs.values()) / self._cost
+        minutes = elapsed_s / frac * remaining / 60
         if minutes < 1:
             return ""
         about = f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
@@ -115,50 +122,67 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """Show one stage of ``total`` units for as long as the context lasts."""
-        forecast = self.forecast
-        stream = self.stream
-        title = self.title + name
-        done = num_lines = 0
-        if forecast:
-            forecast.begin(name, total)
+        """Show one stage for as long as the context lasts.
 
-        def left(count: int) -> str:
-            nonlocal done
-            done += count
-            return forecast.text(done / total) if forecast else ""
+        Args:
+            name: of the stage.
+            total: how many units there are to be done.
+            unit: what is counted, such as ``images``.
 
-        def print_line(text: str) -> None:
-            show(f"{title}: {done}/{total} {unit}{text and ', '}{text}", file=stream)
-
-        def advance_lines(count: int) -> None:
-            nonlocal num_lines
-            text = left(count)
-            if (wanted := done * self.num_plain_lines // total) > num_lines:
-                num_lines = wanted
-                print_line(text)
-
-        if stream is None or total == 0:
+        Yields:
+            A function that is called with the number of units that were done since.
+        """
+        if self.forecast:
+            self.forecast.begin(name, total)
+        if self.stream is None or total == 0:
             yield lambda _: None
         elif self.takes_bars:
-            with (
-                tqdm(total=total, desc=title, unit=unit, file=stream) as bar,
-                _ticking(bar),
-            ):
-
-                def advance(count: int) -> None:
-                    bar.set_postfix_str(left(count), refresh=False)
-                    bar.update(count)
-
-                yield advance
+            yield from self._bar(name, total, unit)
         else:
-            yield advance_lines
-            if not num_lines:
-                print_line("")
+            yield from self._lines(name, total, unit)
+
+    def _bar(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        """Show a stage as a bar; yield what is called with the number of units done."""
+        bar = tqdm(total=total, desc=self.title + name, unit=unit, file=self.stream)
+
+        def advance(count: int) -> None:
+            text = self._remaining_text(bar.n + count, total)
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(count)
+
+        with bar, _refresh_each_second(bar):
+            yield advance
+
+    def _lines(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        """Show a stage as lines; yield what is called with the number of units done."""
+        num_done = 0
+        num_lines = 0
+
+        def print_line(text: str) -> None:
+            more = f", {text}" if text else ""
+            line = f"{self.title}{name}: {num_done}/{total} {unit}{more}"
+            show(line, file=self.stream)
+
+        def advance(count: int) -> None:
+            nonlocal num_done, num_lines
+            num_done += count
+            text = self._remaining_text(num_done, total)
+            num_wanted = num_done * self.num_plain_lines // total
+            if num_wanted > num_lines:
+                num_lines = num_wanted
+                print_line(text)
+
+        yield advance
+        if not num_lines:
+            print_line("")
+
+    def _remaining_text(self, num_done: int, total: int) -> str:
+        """Say how long the first model takes, where that is known."""
+        return self.forecast.text(num_done / total) if self.forecast else ""
 
 
 @contextmanager
-def _ticking(bar: tqdm) -> Iterator[None]:
+def _refresh_each_second(bar: tqdm) -> Iterator[None]:
     """Show each second how long a bar has run: one unit may take a minute."""
     is_over = threading.Event()
 
@@ -187,7 +211,13 @@ def _is_notebook() -> bool:
 
 
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
-    """Print what people or programs read; see :mod:`colmap_affrect.errors`."""
+    """Print what people or programs read; see :mod:`colmap_affrect.errors`.
+
+    Args:
+        text: anything; characters that do not print are escaped.
+        file: where to; None: standard output.
+        end: what follows the text.
+    """
     print(shown(str(text)), file=file, end=end)
 
 
@@ -204,6 +234,5 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[name] = (
-                self.seconds.get(name, 0.0) + time.perf_counter() - start
-            )
+            before_s = self.seconds.get(name, 0.0)
+            self.seconds[name] = before_s + time.perf_counter() - start

@@ -15,7 +15,7 @@ import pydantic
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import CHECKS
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
-from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again
+from colmap_affrect.errors import OptionError, WorkspaceError, damage, how_to_make_again
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
@@ -85,7 +85,7 @@ _RECORDS = pydantic.TypeAdapter(dict[int, CameraRecord])
 
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     """Return the records by camera id; none without the file, WorkspaceError if it is damaged."""
-    with damage(path, made_again("verify", path.parent), WorkspaceError):
+    with damage(path, how_to_make_again("verify", path.parent), WorkspaceError):
         if not path.exists():
             return {}
         return _RECORDS.validate_json(read_regular(path))

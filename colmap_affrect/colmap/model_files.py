@@ -148,7 +148,7 @@ def _read_records(path: Path) -> list[Any]:
 def _mend(folder: Path) -> str:
     """Say how a model is made again."""
     if (folder.parent.parent / "config.toml").exists():
-        return errors.made_again("map", folder.parent.parent)
+        return errors.how_to_make_again("map", folder.parent.parent)
     return "make the model again"
 
 

@@ -98,7 +98,7 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
     learned_models = LearnedModels(
         _set_of(context), score(found), is_sure, present_score(context)
     )
-    context.matches.keep(learned_models=learned_models)
+    context.matches.update_state(learned_models=learned_models)
 
 
 def needs_learned_models(context: Context) -> bool:
@@ -202,7 +202,7 @@ def adopt_chosen_models(escalation: Escalation) -> None:
     if folder.exists():
         guide(context, context.guiding)
         _adopt(context, folder)
-    context.matches.keep(follows="")
+    context.matches.update_state(follows="")
 
 
 def update_keypoints_of_models(context: Context) -> None:
@@ -210,7 +210,7 @@ def update_keypoints_of_models(context: Context) -> None:
 
     Mapping again would be of the same pairs, and might end elsewhere.
     """
-    if context.workspace.mapped_from() != context.to_map():
+    if context.workspace.model_inputs() != context.current_model_inputs():
         _adopt(context, context.workspace.sparse)
 
 
@@ -221,7 +221,7 @@ def _adopt(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
-    workspace.record_mapped(context.to_map())
+    workspace.record_mapping(context.current_model_inputs())
 
 
 # The best models so far
@@ -234,7 +234,7 @@ def keep_best(context: Context) -> None:
     """
     workspace = context.workspace
     is_small = len(context.features.names()) <= SMALL
-    if not is_small or workspace.mapped_from() != context.to_map():
+    if not is_small or workspace.model_inputs() != context.current_model_inputs():
         return
     present = present_score(context)
     if present < best_score(context):

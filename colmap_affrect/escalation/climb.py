@@ -55,10 +55,10 @@ def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]
         escalated = escalation.take_steps(
             escalated, before_each=partial(keep_best, context)
         )
-        before = context.workspace.mapped_from()
+        before = context.workspace.model_inputs()
         reports += _map_on(context, mapper, recipe)
         # Nothing changes where no pair makes a model, or all are mapped.
-        has_mapped = context.workspace.mapped_from() != before
+        has_mapped = context.workspace.model_inputs() != before
         goes_on = (
             has_mapped
             or restore_best(escalation)
@@ -91,7 +91,7 @@ def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageRe
         return []
     remove_alternatives(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
-    matches.keep(modelled=state.listed)
+    matches.update_state(modelled=state.listed)
     return reports
 
 

@@ -73,7 +73,7 @@ def begin(
     options = options or context.escalation
     context.workspace.record_options("escalate", options.to_mapping())
     if context.matches.state.effort != context.effort:
-        context.matches.keep(effort=context.effort)
+        context.matches.update_state(effort=context.effort)
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
@@ -94,7 +94,7 @@ class Tried:
 def matched_again(context: Context) -> Tried:
     """Return what escalation did in a workspace, and what is left for images to match again."""
     workspace = context.workspace
-    if workspace.is_foreign or "escalate" not in workspace.begun:
+    if workspace.is_foreign or "escalate" not in workspace.started_stages:
         return Tried()
     escalation = Escalation(context, context.escalation)
     state = escalation.state
@@ -267,12 +267,12 @@ class Escalation:
             level: number of the level in the recipe.
         """
         if pairs:
-            self.matches.keep(step=Begun(level, tuple(pairs)), has_stepped=True)
+            self.matches.update_state(step=Begun(level, tuple(pairs)), has_stepped=True)
         known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        self.matches.keep(step=None, has_stepped=True)
+        self.matches.update_state(step=None, has_stepped=True)
 
     def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
         """Use the learned matches of a level that are there already, where they are better.
@@ -321,7 +321,7 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.keep(learned_matching=Begun(step.level, tuple(step.pairs)))
+            self.matches.update_state(learned_matching=Begun(step.level, tuple(step.pairs)))
         return bool(step.pairs)
 
     def match_learned(self) -> int:
@@ -452,7 +452,7 @@ class Escalation:
     def _keep_learned(self, batch: Sequence[Trial], _: int) -> None:
         """Write learned matches beside those in use."""
         learned = [Learned(trial.found, trial.worth) for trial in batch]
-        self.matches.keep_learned(learned)
+        self.matches.write_learned(learned)
 
     def _measured_worths(self, batch: Sequence[Trial]) -> dict[Pair, Worth]:
         """Return what the best measured matches are worth of pairs that use learned ones."""

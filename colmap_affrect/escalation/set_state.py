@@ -93,7 +93,9 @@ class SetState:
 
     def _is_mapped(self) -> bool:
         """Tell whether the models are those of the verified pairs."""
-        return self.context.workspace.mapped_from() == self.context.to_map()
+        return (
+            self.context.workspace.model_inputs() == self.context.current_model_inputs()
+        )
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""
@@ -154,7 +156,7 @@ class SetState:
             return {}
         graph = self.context.graph
         found = dict[Pair, int]()
-        with graph.reading() as database:
+        with graph.open_to_read() as database:
             for pair in pairs:
                 first, second = pair
                 matches = database.read_matches(graph.ids[first], graph.ids[second])

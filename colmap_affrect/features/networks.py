@@ -21,7 +21,7 @@ from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Floats, Singles
 from colmap_affrect.geometry.conventions import HALF_PIXEL
-from colmap_affrect.images.warping import halved
+from colmap_affrect.images.warping import half_size
 
 Network = TypeVar("Network", bound=nn.Module)
 State = dict[str, Any]
@@ -201,7 +201,7 @@ def _ready(network: Network, device: str) -> Network:
 
 
 class PatchSampler:
-    """Samples the patches of LAFs from an (H, W) image and its halved versions.
+    """Samples the patches of LAFs from an (H, W) image and its half_size versions.
 
     They are those of ``kornia.feature.extract_patches_from_pyramid``, up to rounding, in a quarter
     of the time: the pyramid is built once, and few patches are sampled at a time.
@@ -210,7 +210,7 @@ class PatchSampler:
     def __init__(self, image: Singles, device: torch.device) -> None:
         levels = [image]
         while min(levels[-1].shape) >= 2 * PATCH_SIZE_PX:
-            levels.append(halved(levels[-1]))
+            levels.append(half_size(levels[-1]))
         self.levels = [
             torch.from_numpy(level)[None, None].to(device) for level in levels
         ]

@@ -52,18 +52,15 @@ class ConversionReport(Summarized):
 
     def summary(self) -> str:
         """Return one line, and one for each file that failed or has another name than usual."""
-        made = sum(len(names) for names in self.written.values())
-        line = f"{len(self.written)} files converted into {made} PNG, {len(self.copied)} copied"
-        named = [f"{new}: instead of {old}" for old, new in self.renamed.items()]
-        folders = [f"{name}: {why}" for name, why in self.left_out.items()]
-        return "\n".join(
-            [
-                line,
-                *named,
-                *folders,
-                *(f"not {n}: {w}" for n, w in self.failures.items()),
-            ]
-        )
+        num_made = sum(map(len, self.written.values()))
+        lines = [
+            f"{len(self.written)} files converted into {num_made} PNG, "
+            f"{len(self.copied)} copied",
+            *[f"{new}: instead of {old}" for old, new in self.renamed.items()],
+            *[f"{name}: {why}" for name, why in self.left_out.items()],
+            *[f"not {name}: {why}" for name, why in self.failures.items()],
+        ]
+        return "\n".join(lines)
 
 
 def convert_images(
@@ -104,7 +101,9 @@ def convert_images(
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
-        conversion = _Conversion(image_path, folder, output_path, names)
+        conversion = _Conversion(
+            image_path=image_path, folder=folder, output_path=output_path, names=names
+        )
         for name in names:
             conversion.add(name)
             advance(1)
@@ -138,25 +137,27 @@ class _Conversion:
             numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
             is_readable = suffix in IMAGE_SUFFIXES and not reading.foreign_format(data)
             if is_readable and numbers == [0]:
-                _require_picture(path, data)
-                made = self._write(name, data.tobytes(), is_copy=True)
-                with suppress(OSError):  # times are not worth a failure
-                    os.utime(self.folder / made, ns=_times(path))
-                self.report.copied.append(made)
+                self._copy(name, data)
                 return
-            ends = (
-                [f"-page{k}" for k in range(1, len(numbers) + 1)]
-                if len(numbers) > 1
-                else [""]
-            )
-            for end, content in zip(ends, _as_png(path, data, numbers), strict=True):
+            for page, content in enumerate(_as_png(path, data, numbers), start=1):
                 # The suffix stays: a.jp2 may lie beside a.png.
+                end = f"-page{page}" if len(numbers) > 1 else ""
                 written.append(self._write(f"{name}{end}.png", content))
             self.report.written[name] = written
         except ImageError as error:
-            for page in written:
-                (self.folder / page).unlink()
+            for made in written:
+                (self.folder / made).unlink()
             self.report.failures[name] = str(error)
+
+    def _copy(self, name: str, data: Bytes) -> None:
+        """Copy a photograph with its times; ImageError if it cannot be decoded."""
+        path = self.image_path / name
+        _require_picture(path, data)
+        made = self._write(name, data.tobytes(), is_copy=True)
+        with suppress(OSError):  # times are not worth a failure
+            there = path.stat()
+            os.utime(self.folder / made, ns=(there.st_atime_ns, there.st_mtime_ns))
+        self.report.copied.append(made)
 
     def _write(self, name: str, content: bytes, *, is_copy: bool = False) -> str:
         """Write a file that is not there yet; return its name, another one where that is taken."""
@@ -168,9 +169,8 @@ class _Conversion:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("xb") as file:
                     file.write(content)
-            except (
-                FileExistsError
-            ):  # names may differ in what the file system does not keep
+            except FileExistsError:
+                # Names may differ in what the file system does not keep.
                 continue
             except OSError as error:
                 raise cannot_write(self.output_path, error) from error
@@ -185,12 +185,9 @@ def _possible_names(name: str) -> Iterator[str]:
     path = PurePosixPath(name)
     for number in count(1):
         stem = path.stem if number == 1 else f"{path.stem}-{number}"
-        yield path.with_name(fitting_name(stem, path.suffix, LONGEST_NAME)).as_posix()
-
-
-def _times(path: Path) -> tuple[int, int]:
-    there = path.stat()
-    return there.st_atime_ns, there.st_mtime_ns
+        yield path.with_name(
+            fitting_name(stem, path.suffix, most=LONGEST_NAME)
+        ).as_posix()
 
 
 def _require_picture(path: Path, data: Bytes) -> None:
@@ -199,11 +196,11 @@ def _require_picture(path: Path, data: Bytes) -> None:
     OpenCV fills up what is missing of a JPEG or PNG; Pillow says so.
     """
     reading.require_possible(path)
-    reading.decoded(data.copy(), path)
+    reading.decode_bytes(data.copy(), path)
     if not data[:8].tobytes().startswith((JPEG, PNG)):
         return
     try:
-        with reading.opened(io.BytesIO(data.data)) as image:
+        with reading.open_image(io.BytesIO(data.data)) as image:
             image.load()
     except Exception as error:  # damaged files raise nearly anything in Pillow
         raise ImageError(f"{path}: is damaged ({error})") from error

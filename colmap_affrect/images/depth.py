@@ -22,12 +22,8 @@ from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.reading import decode, header_size
 from colmap_affrect.options import Options
 
-SUFFIXES = (
-    ".npy",
-    ".png",
-    ".tif",
-    ".tiff",
-)  # in the order in which they are looked for
+# In the order in which they are looked for
+SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 MAX_NUM_VALUES = 1 << 27  # of a map; more is taken for damage
 # Depth of one step of 16 bits; only the ratio of depths matters; theory
 PNG_STEP = 0.001
@@ -48,11 +44,10 @@ class DepthOptions(Options):
 
     def file(self, name: str) -> Path | None:
         """Return the map of an image, if any: ``a/b.jpg.npy`` and so on, then ``a/b.npy``."""
-        stems = (name, splitext(name)[0])
-        paths = (
-            Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES
-        )
-        return next((path for path in paths if path.is_file()), None)
+        names = [f"{name}{suffix}" for suffix in SUFFIXES]
+        names += [f"{splitext(name)[0]}{suffix}" for suffix in SUFFIXES]
+        paths = map(Path(self.path).joinpath, names)
+        return next(filter(Path.is_file, paths), None)
 
 
 class DepthMaps:
@@ -130,10 +125,9 @@ def _read_map(path: Path) -> NDArray[Any]:
     if path.suffix != ".npy":
         if prod(header_size(path) or (0,)) > MAX_NUM_VALUES:
             raise ValueError
-        return decode(path, cv2.IMREAD_UNCHANGED, keeps_numbers=True)
-    values = np.load(
-        path, mmap_mode="r", allow_pickle=False
-    )  # which takes no memory yet
+        return decode(path, flags=cv2.IMREAD_UNCHANGED, keeps_numbers=True)
+    # A map into memory, which takes none yet
+    values = np.load(path, mmap_mode="r", allow_pickle=False)
     if values.size > MAX_NUM_VALUES:
         raise ValueError
     return np.asarray(values)
@@ -141,21 +135,18 @@ def _read_map(path: Path) -> NDArray[Any]:
 
 def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
     """Turn (h, w) values of a kind of depth into float32 z-depth, NaN where it is unknown."""
-    with np.errstate(
-        all="ignore"
-    ):  # unknown values may be anything, and become NaN below
+    # Unknown values may be anything, and become NaN below.
+    with np.errstate(all="ignore"):
         if kind == "inverse":
             values = 1.0 / values
         elif kind == "ray":
             rows, columns = np.indices(values.shape)
-            size = values.shape[1], values.shape[0]
-            camera = (
-                resized_from_original(photograph.size, size) @ photograph.camera_matrix
-            )
+            size = (values.shape[1], values.shape[0])
+            resized = resized_from_original(photograph.size, size)
+            camera = resized @ photograph.camera_matrix
             pixels = np.stack([columns, rows, np.ones(values.shape)])
-            rays = np.tensordot(
-                np.linalg.inv(camera), pixels, axes=1
-            )  # to points of depth 1
+            # To points of depth 1
+            rays = np.tensordot(np.linalg.inv(camera), pixels, axes=1)
             values = values / np.linalg.norm(rays, axis=0)
         depth = values.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))

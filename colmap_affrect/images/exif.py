@@ -13,27 +13,21 @@ from typing import Any, BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.reading import opened, read_header, stored_size
+from colmap_affrect.images.reading import open_image, read_header, stored_size
 
 # Of 35 mm film, to which equivalents refer (by COLMAP's rounding)
 FILM_DIAGONAL_MM = 43.27
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
-mm and micrometres; format."""
-PLAUSIBLE_FOCALS = (
-    0.3,
-    6.0,
-)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses; theory
-# Ratio of focal lengths that still agree: equivalents are rounded; theory
+mm and micrometres."""
+# In longer sides: 118 to 10 degrees, which hold nearly all lenses
+PLAUSIBLE_FOCALS = (0.3, 6.0)
+# Ratio of focal lengths that still agree: equivalents are rounded
 MAX_CONTRADICTION = 1.15
-# Lossless rotation cuts off up to 15 px, shrinking rounds; theory
-MAX_ASPECT_ERROR = 0.01
-SENSOR_ASPECTS = (
-    3 / 2,
-    4 / 3,
-    16 / 9,
-)  # photographs of another shape may have been cropped; theory
-# Longer side of the thumbnails of cameras, often with black bars; format
+MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
+# Photographs of another shape may have been cropped
+SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
+# Longer side of the thumbnails of cameras, often with black bars
 MAX_THUMBNAIL_PX = 160
 RESOLUTION = "focal-plane resolution"
 EQUIVALENT = "35 mm equivalent"
@@ -60,10 +54,8 @@ class CameraTags:
     def identity(self) -> tuple[object, ...] | None:
         """What photographs of one camera have in common; None where EXIF has no camera."""
         make, model, _ = self.body
-        if (
-            not (make and model and (self.focal_mm or self.equivalent_mm))
-            or self.was_cropped
-        ):
+        has_focal = bool(self.focal_mm or self.equivalent_mm)
+        if not (make and model and has_focal) or self.was_cropped:
             return None
         return (
             *self.body,
@@ -92,9 +84,8 @@ class CameraTags:
 class ExifFocal:
     """A focal length, or why there is none."""
 
-    focal_px: (
-        float | None
-    )  # of the stored file; None if EXIF does not say or cannot be trusted
+    # Of the stored file; None if EXIF does not say or cannot be trusted
+    focal_px: float | None
     is_rescaled: bool = False  # it is not the one that COLMAP would take
     why: str = ""  # what is wrong; empty if nothing
     # Focal length of the lens, where nothing tells how large the sensor is
@@ -109,7 +100,7 @@ def read_camera_tags(path: Path) -> CameraTags | None:
 
 
 def _tags_of_file(file: BinaryIO) -> CameraTags:
-    image = opened(file)
+    image = open_image(file)
     tag = ExifTags.Base
     size = stored_size(image)
     tags = dict[int, Any]()
@@ -125,23 +116,39 @@ def _tags_of_file(file: BinaryIO) -> CameraTags:
         value = tags.get(key)
         return value.strip(" \t\r\n\0") if isinstance(value, str) else ""
 
-    unit = MM_PER_UNIT.get(int(_positive(tags.get(tag.FocalPlaneResolutionUnit)) or 0))
-    across = number(tag.FocalPlaneXResolution)
-    down = number(tag.FocalPlaneYResolution)
-    width = number(tag.ExifImageWidth)
-    height = number(tag.ExifImageHeight)
     return CameraTags(
-        size,
-        (text(tag.Make), text(tag.Model), text(tag.BodySerialNumber)),
-        text(tag.LensModel),
-        number(tag.FocalLength),
-        number(tag.FocalLengthIn35mmFilm),
-        (across / unit, down / unit if down else None) if across and unit else None,
-        (int(width), int(height))
-        if width and height and min(width, height) >= 1
-        else None,
-        max(1.0, number(tag.DigitalZoomRatio) or 1.0),
+        size=size,
+        body=(text(tag.Make), text(tag.Model), text(tag.BodySerialNumber)),
+        lens=text(tag.LensModel),
+        focal_mm=number(tag.FocalLength),
+        equivalent_mm=number(tag.FocalLengthIn35mmFilm),
+        px_per_mm=_resolution(
+            number(tag.FocalPlaneXResolution),
+            down=number(tag.FocalPlaneYResolution),
+            unit_number=number(tag.FocalPlaneResolutionUnit),
+        ),
+        original_size=_whole_size(
+            number(tag.ExifImageWidth), number(tag.ExifImageHeight)
+        ),
+        zoom=max(1.0, number(tag.DigitalZoomRatio) or 1.0),
     )
+
+
+def _resolution(
+    across: float | None, down: float | None, unit_number: float | None
+) -> tuple[float, float | None] | None:
+    """Return px per mm in x and perhaps y, from pixels per unit and EXIF's number of the unit."""
+    unit = MM_PER_UNIT.get(int(unit_number or 0))
+    if not across or not unit:
+        return None
+    return across / unit, down / unit if down else None
+
+
+def _whole_size(width: float | None, height: float | None) -> tuple[int, int] | None:
+    """Return (width, height) in px; None where one is missing or below a pixel."""
+    if not width or not height or min(width, height) < 1:
+        return None
+    return int(width), int(height)
 
 
 def _positive(value: object) -> float | None:
@@ -171,38 +178,37 @@ def exif_focal(
     resolution, width of the sensor of this model, where it is known.
 
     Args:
-        tags: What the file says.
-        sensor_width_mm: Longer side of the sensor, where it is known.
-        has_crops: Whether other photographs of this camera were cropped. One that is smaller than
+        tags: what the file says.
+        sensor_width_mm: longer side of the sensor, where it is known.
+        has_crops: whether other photographs of this camera were cropped. One that is smaller than
             when it was taken may then be a crop, too, also where it has kept its shape.
+
+    Returns:
+        The focal length, or why there is none.
     """
     if tags.was_cropped or (has_crops and tags.scale < 1.0):
-        why = (
-            "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
-        )
-        whole = exif_focal(
-            replace(tags, size=tags.original_size or tags.size), sensor_width_mm
-        )
-        return ExifFocal(
-            None, why=f"{why}: {_sizes(tags)}", uncropped_px=whole.focal_px or 0.0
-        )
+        return _focal_of_crop(tags, sensor_width_mm)
     if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
         return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
     stated = _statements(tags, sensor_width_mm)
-    longer = max(tags.size)
-    low, high = PLAUSIBLE_FOCALS
-    plausible = {k: f for k, f in stated.items() if low * longer <= f <= high * longer}
-    if not plausible:
-        key, focal = next(iter(stated.items()), ("", 0.0))
-        wrong = (
-            f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
-        )
-        if stated:
-            return ExifFocal(None, why=wrong)
+    if not stated:
         return ExifFocal(
-            None, why="no EXIF focal length in px", lens_mm=tags.focal_mm or 0.0
+            focal_px=None,
+            why="no EXIF focal length in px",
+            lens_mm=tags.focal_mm or 0.0,
         )
-    return _reconciled(tags, stated, plausible)
+    return _reconcile(tags, stated)
+
+
+def _focal_of_crop(tags: CameraTags, sensor_width_mm: float | None) -> ExifFocal:
+    """Return no focal length, but that of the whole photograph, if EXIF says it."""
+    original = replace(tags, size=tags.original_size or tags.size)
+    what = "cropped or padded" if tags.was_cropped else "cropped, as others, or shrunk"
+    return ExifFocal(
+        focal_px=None,
+        why=f"{what}: {_sizes(tags)}",
+        uncropped_px=exif_focal(original, sensor_width_mm).focal_px or 0.0,
+    )
 
 
 def _sizes(tags: CameraTags) -> str:
@@ -227,28 +233,57 @@ def _statements(tags: CameraTags, sensor_width_mm: float | None) -> dict[str, fl
     return found
 
 
-def _reconciled(
-    tags: CameraTags, stated: Mapping[str, float], plausible: Mapping[str, float]
-) -> ExifFocal:
-    """Choose among plausible focal lengths, of which some may contradict each other.
+def _reconcile(tags: CameraTags, stated: Mapping[str, float]) -> ExifFocal:
+    """Choose among focal lengths in px, some of which may be absurd, or contradict each other.
 
     Against a resolution, which alone counts for pixels and not for the whole frame, the others are
     right if the photograph was shrunk, wrong if it was cropped.
     """
-    colmaps = next(iter(stated))
-    key, focal = next(iter(plausible.items()))
-    if not all(_agree(other, focal) for other in plausible.values()):
-        if not any(_similar(_aspect(tags.size), aspect) for aspect in SENSOR_ASPECTS):
-            values = " and ".join(
-                f"{f:.0f} px by its {k}" for k, f in plausible.items()
+    plausible = _plausible_focals(stated, max(tags.size))
+    colmaps_key = next(iter(stated))
+    if not plausible:
+        share = stated[colmaps_key] / max(tags.size)
+        return ExifFocal(
+            focal_px=None,
+            why=f"EXIF's {colmaps_key} would be a focal length of {share:.2g} longer sides",
+        )
+    key = next(iter(plausible))
+    if _contradicting(plausible, plausible[key]):
+        if not _may_be_whole(tags.size):
+            texts = [f"{focal:.0f} px by its {k}" for k, focal in plausible.items()]
+            return ExifFocal(
+                focal_px=None, why=f"EXIF contradicts itself: {' and '.join(texts)}"
             )
-            return ExifFocal(None, why=f"EXIF contradicts itself: {values}")
         key = next(each for each in plausible if each != RESOLUTION)
+    focal_px = plausible[key]
     if key == RESOLUTION and tags.scale != 1.0:
-        return ExifFocal(plausible[key], True, f"shrunk: {_sizes(tags)}")
-    wrong = [k for k, f in stated.items() if not _agree(f, plausible[key])]
-    why = f"EXIF's {' and '.join(wrong)} is not that of these pixels, its {key} counts"
-    return ExifFocal(plausible[key], key != colmaps, why if wrong else "")
+        return ExifFocal(
+            focal_px=focal_px, is_rescaled=True, why=f"shrunk: {_sizes(tags)}"
+        )
+    wrong = " and ".join(_contradicting(stated, focal_px))
+    why = f"EXIF's {wrong} is not that of these pixels, its {key} counts"
+    return ExifFocal(
+        focal_px=focal_px, is_rescaled=key != colmaps_key, why=why if wrong else ""
+    )
+
+
+def _plausible_focals(stated: Mapping[str, float], longer: int) -> dict[str, float]:
+    """Return the focal lengths that a photograph of this longer side in px may have."""
+    low, high = PLAUSIBLE_FOCALS
+    return {
+        key: focal
+        for key, focal in stated.items()
+        if low * longer <= focal <= high * longer
+    }
+
+
+def _contradicting(stated: Mapping[str, float], focal_px: float) -> list[str]:
+    return [key for key, other in stated.items() if not _agree(other, focal_px)]
+
+
+def _may_be_whole(size: tuple[int, int]) -> bool:
+    """Tell whether a photograph of (width, height) px has the shape of a sensor."""
+    return any(_similar(_aspect(size), aspect) for aspect in SENSOR_ASPECTS)
 
 
 def _agree(first: float, second: float) -> bool:

@@ -49,9 +49,9 @@ def segments_of(image: GrayImage, mask: Mask | None = None) -> Segments:
     longer_side = max(width, height)
     lengths = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
     keep = lengths > MIN_LENGTH * longer_side
-    keep &= ~_on_frame(ends, lengths, (width, height))
+    keep &= ~_on_frame(ends, lengths, size=(width, height))
     if mask is not None:
-        keep &= _in_mask(ends, mask, (width, height))
+        keep &= _in_mask(ends, mask, size=(width, height))
     return Segments.of_image(ends[keep], (width, height))
 
 

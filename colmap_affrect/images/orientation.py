@@ -10,7 +10,8 @@ from typing import BinaryIO
 import numpy as np
 from PIL import ExifTags
 
-from colmap_affrect.images.reading import PNG, opened, read_header, stand_upright
+from colmap_affrect.images.reading import PNG, open_image, read_header
+from colmap_affrect.images.tiff import stand_upright
 from colmap_affrect.project.atomic_files import replace_bytes
 
 UPRIGHT = 1  # EXIF's number; format
@@ -32,7 +33,7 @@ def forget_orientation(path: Path) -> None:
         _change_png(data)
     else:
         stand_upright(np.frombuffer(data, np.uint8))
-        _change_xmp(data, 0, len(data))
+        _change_xmp(data, start=0, end=len(data))
     if data != before:
         replace_bytes(path, bytes(data))  # not what it may be linked to
 
@@ -43,7 +44,7 @@ def orientation(path: Path) -> int:
 
 
 def _orientation(file: BinaryIO) -> int:
-    return int(opened(file).getexif().get(ExifTags.Base.Orientation, UPRIGHT))
+    return int(open_image(file).getexif().get(ExifTags.Base.Orientation, UPRIGHT))
 
 
 def _change_xmp(data: bytearray, start: int, end: int) -> None:
@@ -61,7 +62,7 @@ def _change_exif(data: bytearray, start: int, end: int) -> None:
 def _change_jpeg(data: bytearray) -> None:
     for start, end in _jpeg_segments(data):
         if data.startswith(JPEG_EXIF, start):
-            _change_exif(data, start + len(JPEG_EXIF), end)
+            _change_exif(data, start=start + len(JPEG_EXIF), end=end)
         elif data.startswith(JPEG_XMP, start):
             _change_xmp(data, start, end)
 

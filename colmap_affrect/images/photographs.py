@@ -95,23 +95,22 @@ class Photographs:
 
         Where an image has no file of its own for it, its alpha channel is its mask.
         """
+        image_path = self.folder / name
+        masks = list[Mask]()
+        paths = list[Path]()
         own = self.own_mask(name)
-        paths = [own] if own else []
-        alpha = None if paths else reading.alpha_mask(self.folder / name)
-        paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
-        size = reading.header_size(self.folder / name)
-        masks = [] if alpha is None else [alpha]
+        alpha = None if own else reading.alpha_mask(image_path)
+        if own:
+            paths.append(own)
+        if alpha is not None:
+            masks.append(alpha)
+        if self.masks.camera_path:
+            paths.append(Path(self.masks.camera_path))
+        size = reading.header_size(image_path)
         for path in paths:
-            found = reading.header_size(path)
-            if not size or found in (None, size):
-                masks.append(reading.read_mask(path))
-                found = masks[-1].shape[1], masks[-1].shape[0]
-            size = size or found
-            if found != size:
-                raise ImageError(
-                    f"{self.folder / name}: is {size[0]} x {size[1]} px and its mask {found[0]} x "
-                    f"{found[1]} px ({path}); they must have one size"
-                )
+            mask = _mask_of_size(path, size, image_path)
+            masks.append(mask)
+            size = (mask.shape[1], mask.shape[0])
         return np.logical_and.reduce(masks) if masks else None
 
     def own_mask(self, name: str) -> Path | None:
@@ -183,6 +182,25 @@ class Photographs:
         return next(filter(None, map(reading.why_unusable, paths)), "")
 
 
+def _mask_of_size(path: Path, size: tuple[int, int] | None, image_path: Path) -> Mask:
+    """Read the mask of an image of (width, height) px; None: of any size.
+
+    Its header is looked at first: a mask of another size is not decoded. Raises ImageError.
+    """
+    found = reading.header_size(path)
+    if size is None:
+        return reading.read_mask(path)
+    if found is None or found == size:
+        mask = reading.read_mask(path)
+        found = (mask.shape[1], mask.shape[0])
+        if found == size:
+            return mask
+    raise ImageError(
+        f"{image_path}: is {size[0]} x {size[1]} px and its mask {found[0]} x {found[1]} px "
+        f"({path}); they must have one size"
+    )
+
+
 def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
     """Return the sorted names, relative to ``image_path``, of all images below it or of a list.
 
@@ -192,13 +210,11 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     require_folder(image_path)
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
-    names = [
-        name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)
-    ]
+    files = photograph_files(image_path, IMAGE_SUFFIXES)
+    names = [name for name in files if not _odd(name)]
     if not names:
-        others = "".join(
-            f"; {kind}: {what}" for kind, what in left_out(image_path).items()
-        )
+        reasons = left_out(image_path).items()
+        others = "".join(f"; {kind}: {why}" for kind, why in reasons)
         raise OptionError(
             f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}"
         )
@@ -218,20 +234,21 @@ def require_folder(image_path: Path) -> None:
 def left_out(image_path: Path) -> dict[str, str]:
     """Return why photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
-    files, notes = _walk(image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS))
+    files, reasons = _walk(
+        image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)
+    )
     for name in sorted(files):
         suffix = _suffix(name)
         if suffix not in IMAGE_SUFFIXES:
             found.setdefault(f"*{suffix}", []).append(name)
         elif _odd(name):
             found.setdefault("names", []).append(name)
-        if (
-            suffix in TIFF_SUFFIXES
-            and (count := len(reading.pages(image_path / name))) > 1
-        ):
-            notes[name] = (
-                f"has {count} pages, and only the first is used; colmap-affrect convert makes a "
-                "file of each"
+        is_tiff = suffix in TIFF_SUFFIXES
+        num_pages = len(reading.pages(image_path / name)) if is_tiff else 1
+        if num_pages > 1:
+            reasons[name] = (
+                f"has {num_pages} pages, and only the first is used; colmap-affrect convert makes "
+                "a file of each"
             )
     for kind, names in found.items():
         why = (
@@ -241,8 +258,8 @@ def left_out(image_path: Path) -> dict[str, str]:
             why = "it is a video; take photographs out of it, as: ffmpeg -i it -vf fps=2 %04d.jpg"
         elif kind == "names":
             why = f"{_odd(names[0])}; rename it"
-        notes[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
-    return notes
+        reasons[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
+    return reasons
 
 
 def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
@@ -271,14 +288,13 @@ def folders_left_out(folder: Path) -> dict[str, str]:
 
 
 def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the files below a folder that end so, and notes of what is left out."""
+    """Return the names of the files below a folder that end so, and why folders are left out."""
     walk = _Walk(folder, suffixes)
     while walk.ahead or walk.linked:
         walk.enter(walk.ahead.popleft() if walk.ahead else walk.linked.popleft())
-    return walk.found, {
-        such_as(map(one_line, names)): f"left out: {why}"
-        for why, names in walk.left_out.items()
-    }
+    left_out = walk.left_out.items()
+    reasons = {such_as(map(one_line, names)): f"left out: {w}" for w, names in left_out}
+    return walk.found, reasons
 
 
 class _Walk:
@@ -298,11 +314,9 @@ class _Walk:
 
     def enter(self, path: Path) -> None:
         """Look through a folder, but not through those in it, if nobody has done that."""
-        below = (
-            ""
-            if path == self.folder
-            else f"{path.relative_to(self.folder).as_posix()}/"
-        )
+        below = ""
+        if path != self.folder:
+            below = f"{path.relative_to(self.folder).as_posix()}/"
         try:
             identity = _identity(path)
             entries = sorted(os.scandir(path), key=lambda entry: entry.name)
@@ -373,18 +387,29 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
             listed.append(line.strip())
     if not listed:
         raise OptionError(f"{image_list_path}: is empty")
-    return checked_names(image_path, listed, str(image_list_path))
+    return checked_names(image_path, names=listed, where=str(image_list_path))
 
 
 def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> list[str]:
-    """Return the sorted names of images, each once.
+    """Check that images are there, and can be named in lists.
 
-    OptionError for one that is not below the folder, ImageError for one that lists cannot hold.
+    Args:
+        image_path: folder of the photographs.
+        names: relative to it.
+        where: they are from, for errors.
+
+    Returns:
+        The sorted names, each once.
+
+    Raises:
+        OptionError: one is not below the folder.
+        ImageError: one has a name that lists cannot hold.
     """
     found = sorted({PurePosixPath(as_path(name)).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
-        if why := _odd(name):
+        why = _odd(name)
+        if why:
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
         raise OptionError(

@@ -46,7 +46,7 @@ def pnm_header(data: Bytes) -> PnmHeader | None:
     return PnmHeader(int(white), kind in TEXT_KINDS)
 
 
-def ended(data: Bytes) -> Bytes:
+def with_line_end(data: Bytes) -> Bytes:
     """Return the (N,) bytes of a picture that is written as text, with a line's end after it."""
     return np.append(data, np.uint8(ord("\n")))
 

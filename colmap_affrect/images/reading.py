@@ -7,7 +7,6 @@ import re
 import struct
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO, TypeVar
@@ -25,24 +24,28 @@ from PIL.TiffImagePlugin import TiffImageFile
 from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
-from colmap_affrect.images.pnm import MAX_HEADER, ended, pnm_header, with_usual_white
+from colmap_affrect.images.pnm import (
+    MAX_HEADER,
+    pnm_header,
+    with_line_end,
+    with_usual_white,
+)
+from colmap_affrect.images.tiff import stand_upright
 from colmap_affrect.project.regular_files import (
     NotAFileError,
     open_regular,
     require_regular,
 )
 
-MAX_NUM_PX = (
-    1 << 29
-)  # of a photograph; those of the largest cameras have 400 megapixels; damage
-MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes; damage
+# Of a photograph; those of the largest cameras have 400 megapixels
+MAX_NUM_PX = 1 << 29
+MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
 USUAL_BYTES = 1 << 26
 """Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
-files are compared with their pixels; resource."""
-MAX_BYTES_PER_PX = 16  # four channels of four bytes; format
-ONE_AT_A_TIME = (
-    Lock()
-)  # filters of warnings are of the process: threads would mix them up
+files are compared with their pixels."""
+MAX_BYTES_PER_PX = 16  # four channels of four bytes
+# Filters of warnings are of the process: threads would mix them up
+ONE_AT_A_TIME = Lock()
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = b"P"
 READERS = {
@@ -54,10 +57,8 @@ READERS = {
     PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
-NEW_SUBFILE_TYPE, REDUCED = (
-    254,
-    1,
-)  # TIFF's tag, and its bit of a smaller copy of another page; format
+NEW_SUBFILE_TYPE = 254  # TIFF's tag of what a page is
+REDUCED = 1  # its bit of a smaller copy of another page
 
 Found = TypeVar("Found")
 
@@ -72,15 +73,16 @@ def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
         return None
 
 
-def opened(file: BinaryIO) -> Image.Image:
+def open_image(file: BinaryIO) -> Image.Image:
     """Open an image by its header; what is damaged raises nearly anything."""
     start = file.read(len(PNG))
     file.seek(0)
     if start.startswith(PNM):  # whose header Pillow reads byte by byte
         file = io.BytesIO(file.read(MAX_HEADER))
-    return next(read for magic, read in READERS.items() if start.startswith(magic))(
-        file, ""
-    )
+    for magic, reader in READERS.items():
+        if start.startswith(magic):
+            return reader(file, "")
+    raise ValueError(UNREADABLE)
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -97,7 +99,7 @@ def pages(path: Path) -> list[int]:
 
 
 def _tiff_pages(file: BinaryIO) -> list[int]:
-    image = opened(file)
+    image = open_image(file)
     found = []
     if isinstance(image, TiffImageFile):
         for page in range(image.n_frames):
@@ -117,7 +119,7 @@ def _claimed_size(file: BinaryIO) -> tuple[int, int]:
     if start.startswith(PNG):
         return struct.unpack(">II", start[16:])
     file.seek(0)
-    return stored_size(opened(file))
+    return stored_size(open_image(file))
 
 
 def why_unusable(path: Path) -> str:
@@ -175,7 +177,7 @@ def _require_plausible(path: Path, num_bytes: int) -> None:
 
 def _num_px_of_pages(file: BinaryIO) -> int:
     """Return the number of pixels of a picture, of a TIFF those of all its pages."""
-    image = opened(file)
+    image = open_image(file)
     num = 0
     for page in range(getattr(image, "n_frames", 1)):
         image.seek(page)
@@ -228,12 +230,14 @@ def require_possible(path: Path) -> None:
 
 
 UNREADABLE = "not a readable image (damaged, empty, or of an unknown format)"
-LIMITS_OF_OPENCV = tuple(
-    f"OPENCV_IO_MAX_IMAGE_{what}" for what in ("PIXELS", "WIDTH", "HEIGHT")
+LIMITS_OF_OPENCV = (
+    "OPENCV_IO_MAX_IMAGE_PIXELS",
+    "OPENCV_IO_MAX_IMAGE_WIDTH",
+    "OPENCV_IO_MAX_IMAGE_HEIGHT",
 )
-OPENCV_CHECKS_SIZE = (
-    "validateInputImageSize"  # its function that compares a header with these
-)
+# OpenCV's function that compares a header with these
+OPENCV_CHECKS_SIZE = "validateInputImageSize"
+MODES_WITH_ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")  # Pillow's
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
     ".ppm",
@@ -254,30 +258,23 @@ FOREIGN_FORMATS = {
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
 """First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
-TONE_PERCENTILES = (
-    0.5,
-    99.5,
-)  # black and white of a stretched photograph but for dust and glints; judged
-# A photograph whose tones fill less of the range of its file is stretched; judged
+# Black and white of a stretched photograph but for dust and glints
+TONE_PERCENTILES = (0.5, 99.5)
+# A photograph whose tones fill less of the range of its file is stretched
 MIN_TONE_RANGE = 0.5
-# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise; judged
+# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
 MAX_TONE_STEP = 16
-FLOAT_RANGE = (
-    -0.5,
-    2.0,
-)  # of floats that are meant from 0 to 1: filters and highlights go beyond; theory
-NUM_TONES = 250_000  # about so many pixels are looked at; resource
-# Along each border is passed over: scans have frames and captions there; judged
+# Of floats that are meant from 0 to 1: filters and highlights go beyond
+FLOAT_RANGE = (-0.5, 2.0)
+NUM_TONES = 250_000  # about so many pixels are looked at
+# Along each border is passed over: scans have frames and captions there
 FRAME_FRAC = 0.1
-# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits; format
-BIG_TIFF = 43
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-EIGHTH_OF_COLOR = (
-    cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
-)  # fast, of JPEG
+# Fast, of JPEG
+EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_gray(path: Path) -> GrayImage:
@@ -286,21 +283,28 @@ def read_gray(path: Path) -> GrayImage:
 
 
 def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
-    """Read an image in colour as :func:`read_gray`, shrunk to at most ``max_size_px``.
+    """Read an image in colour, without applying EXIF orientation.
 
-    With ``stretch`` low contrast fills the range (:func:`tones`).
+    Args:
+        path: the file.
+        max_size_px: longest side that the image is shrunk to.
+        stretch: whether low contrast fills the range (:func:`tones`).
+
+    Returns:
+        (H, W, 3) uint8, RGB.
+
+    Raises:
+        ImageError: it is no image.
     """
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px
+    flags = EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED
     try:
-        image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[
-            :, :, ::-1
-        ]
+        image = decode(path, flags)[:, :, ::-1]
     except ImageError:  # OpenCV makes no colour of one channel of floats
         image = np.repeat(decode(path)[:, :, None], 3, axis=2)
-    return shrink_to(
-        in_eight_bits(image, tones(image) if stretch else None), max_size_px
-    )
+    black_and_white = tones(image) if stretch else None
+    return shrink_to(in_eight_bits(image, black_and_white), max_size_px)
 
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
@@ -342,9 +346,8 @@ def range_of_floats(image: NDArray[Any]) -> tuple[float, float] | None:
     is_float = np.issubdtype(image.dtype, np.floating)
     if is_float and low >= FLOAT_RANGE[0] and high <= FLOAT_RANGE[1]:
         return None
-    return float(low), float(
-        max(high, low + np.finfo(np.float32).eps * max(abs(low), 1.0))
-    )
+    least = low + np.finfo(np.float32).eps * max(abs(low), 1.0)
+    return float(low), float(max(high, least))
 
 
 def in_eight_bits(
@@ -371,9 +374,8 @@ def in_eight_bits(
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
-    return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[
-        1
-    ].tobytes()
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(".jpg", ordered, parameters)[1].tobytes()
 
 
 def decode(
@@ -393,18 +395,32 @@ def decode(
         ImageError: it is no image.
     """
     require_possible(path)
-    return decoded(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
+    return decode_bytes(read_photograph(path), path, flags, keeps_numbers=keeps_numbers)
 
 
-def decoded(
+def decode_bytes(
     data: Bytes,
     path: Path,
     flags: int = GRAY_AS_STORED,
     *,
     keeps_numbers: bool = False,
 ) -> NDArray[Any]:
-    """Decode the bytes of a photograph, which may change them; see :func:`decode`."""
-    if name := foreign_format(data):
+    """Decode the bytes of a photograph, which may change them.
+
+    Args:
+        data: (N,) bytes of the file.
+        path: of the file, for errors.
+        flags: OpenCV's.
+        keeps_numbers: see :func:`decode`.
+
+    Returns:
+        (H, W) or (H, W, channels).
+
+    Raises:
+        ImageError: it is no image.
+    """
+    name = foreign_format(data)
+    if name:
         raise ImageError(
             f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
@@ -412,7 +428,7 @@ def decoded(
     stand_upright(data)
     header = pnm_header(data)
     if header and header.is_text:
-        data = ended(data)
+        data = with_line_end(data)
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
@@ -437,36 +453,10 @@ def _why_not_decoded(error: cv2.error) -> str:
 def foreign_format(data: Bytes) -> str:
     """Return the format of data that COLMAP cannot read, whatever the suffix, else nothing."""
     beginning = data[:16].tobytes()
-    matching = (
-        n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL)
-    )
-    return next(matching, "")
-
-
-def stand_upright(data: Bytes) -> None:
-    """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say.
-
-    EXIF is laid out as a TIFF is.
-    """
-    order = {b"II": "<", b"MM": ">"}.get(data[:2].tobytes())
-    if not order:
-        return
-    content = data.data
-    with suppress(struct.error):  # damaged
-        (version,) = struct.unpack_from(f"{order}H", content, 2)
-        where, offset, number, size = (
-            (8, "Q", "Q", 20) if version == BIG_TIFF else (4, "I", "H", 12)
-        )
-        (start,) = struct.unpack_from(order + offset, content, where)
-        (count,) = struct.unpack_from(order + number, content, start)
-        first = start + struct.calcsize(number)
-        for entry in range(first, min(first + count * size, data.size), size):
-            if struct.unpack_from(f"{order}H", content, entry) == (
-                ExifTags.Base.Orientation,
-            ):
-                struct.pack_into(
-                    f"{order}H", content, entry + size - struct.calcsize(offset), 1
-                )
+    for name, pattern in FOREIGN_FORMATS.items():
+        if re.match(pattern, beginning, re.DOTALL):
+            return name
+    return ""
 
 
 def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
@@ -475,9 +465,13 @@ def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
     scale = max_size_px / max(width, height)
     if scale >= 1.0:
         return image
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        cv2.resize(
+            image,
+            dsize=(max(1, round(width * scale)), max(1, round(height * scale))),
+            interpolation=cv2.INTER_AREA,
+        ),
+        dtype=np.uint8,
     )
 
 
@@ -499,26 +493,23 @@ def alpha_mask(path: Path) -> Mask | None:
     alpha = image[:, :, 3] if is_there else read_header(path, _alpha_beside_gray)
     if alpha is None:
         return None
-    half = (
-        np.iinfo(alpha.dtype).max / 2 if np.issubdtype(alpha.dtype, np.integer) else 0.5
-    )
+    is_integer = np.issubdtype(alpha.dtype, np.integer)
+    half = np.iinfo(alpha.dtype).max / 2 if is_integer else 0.5
     mask = np.asarray(alpha > half)
     return mask if mask.any() and not mask.all() else None
 
 
 def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
     """Read the alpha channel of a gray TIFF, which OpenCV drops; None of one that Pillow turns."""
-    image = opened(file)
+    image = open_image(file)
     if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         return None
     return np.asarray(image.convert("RGBA").getchannel("A"))
 
 
 def _has_alpha(file: BinaryIO) -> bool:
-    image = opened(file)
-    return (
-        image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
-    )
+    image = open_image(file)
+    return image.mode in MODES_WITH_ALPHA or "transparency" in image.info
 
 
 def encode_mask(mask: Mask) -> bytes:
@@ -528,13 +519,15 @@ def encode_mask(mask: Mask) -> bytes:
 
 def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
-    values = mask.astype(np.uint8)
-    return np.asarray(
-        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    resized = cv2.resize(
+        mask.astype(np.uint8),
+        dsize=size,
+        interpolation=cv2.INTER_NEAREST_EXACT,
     )
+    return np.asarray(resized > 0)
 
 
-def grown(mask: Mask, num_px: int) -> Mask:
+def grow_mask(mask: Mask, num_px: int) -> Mask:
     """Add the pixels of an (H, W) mask's surroundings, so many in each direction."""
     kernel = np.ones((2 * num_px + 1, 2 * num_px + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

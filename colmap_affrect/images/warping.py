@@ -12,25 +12,32 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
-# Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT); paper
+# Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
 ANTI_ALIASING_SIGMA = 0.8
-# Of the square tiles of homographies, each blurred for its strongest compression; resource
-TILE_PX = 64
-# Points along a side of a tile at which its compression is measured; resource
+TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
+# Points along a side of a tile at which its compression is measured
 SAMPLES_PER_TILE = 5
-# Samples per px of a warp along an axis; beyond, memory counts more than aliasing; resource
+# Samples per px of a warp along an axis; beyond, memory counts more than aliasing
 MAX_DENSITY = 16
 
 
-def halved(image: Singles) -> Singles:
+def half_size(image: Singles) -> Singles:
     """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
     smooth = cv2.sepFilter2D(
-        image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101
+        image,
+        ddepth=-1,
+        kernelX=kernel,
+        kernelY=kernel,
+        borderType=cv2.BORDER_REFLECT_101,
     )
-    size = (image.shape[1] // 2, image.shape[0] // 2)
     return np.asarray(
-        cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32
+        cv2.resize(
+            smooth,
+            dsize=(image.shape[1] // 2, image.shape[0] // 2),
+            interpolation=cv2.INTER_LINEAR,
+        ),
+        dtype=np.float32,
     )
 
 
@@ -54,7 +61,7 @@ def warp(
         (*rectification.canvas_size[::-1], *source.shape[2:]), dtype=np.uint8
     )
     for tile, image_from_tile in _tiles(warped, rectification):
-        tile[:] = np.rint(_warp_tile(source, image_from_tile, tile.shape[1::-1]))
+        tile[:] = np.rint(_warp_tile(source, image_from_tile, size=tile.shape[1::-1]))
     return warped
 
 
@@ -65,10 +72,12 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
     compression = 1.0 / float(np.hypot(*matrix[1, :2]))
     density = max(1, ceil(compression - 1e-9))
     dense_from_image = np.diag([1.0, density, 1.0]) @ matrix
-    size = (width, (height - 1) * density + 1)
-    border = cv2.BORDER_REFLECT_101
     dense = cv2.warpAffine(
-        source, dense_from_image[:2], size, flags=cv2.INTER_LINEAR, borderMode=border
+        source,
+        M=dense_from_image[:2],
+        dsize=(width, (height - 1) * density + 1),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
     )
     sigma_px = _anti_aliasing_sigma(compression, density)
     if sigma_px > 0.0:
@@ -78,12 +87,8 @@ def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
 
 def _anti_aliasing_sigma(compression: float, density: int) -> float:
     """Return the blur before a compression, in px of a grid ``density`` times the warp's."""
-    return (
-        ANTI_ALIASING_SIGMA
-        * sqrt(max(compression**2 - 1.0, 0.0))
-        * density
-        / compression
-    )
+    blur = ANTI_ALIASING_SIGMA * sqrt(max(compression**2 - 1.0, 0.0))
+    return blur * density / compression
 
 
 def _tiles(
@@ -102,19 +107,30 @@ def _warp_tile(
     source: Singles, image_from_tile: Array, size: tuple[int, int]
 ) -> Singles:
     """Render one tile of (width, height), with surroundings as far as the blur reaches."""
-    compressions = _compressions(image_from_tile, size, source.shape[1::-1])
-    density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(
-        int
-    )
-    sigma_x, sigma_y = map(_anti_aliasing_sigma, compressions, (density_x, density_y))
+    compressions = _compressions(image_from_tile, size, image_size=source.shape[1::-1])
+    densities = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY)
+    density_x, density_y = densities.astype(int)
+    sigma_x = _anti_aliasing_sigma(compressions[0], density_x)
+    sigma_y = _anti_aliasing_sigma(compressions[1], density_y)
     reach_x = ceil(3 * sigma_x)
     reach_y = ceil(3 * sigma_y)
     columns = np.arange(-reach_x, (size[0] - 1) * density_x + reach_x + 1) / density_x
     rows = np.arange(-reach_y, (size[1] - 1) * density_y + reach_y + 1) / density_y
-    x, y, _ = _source_points(image_from_tile, columns, rows, source.shape[1::-1])
-    dense = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    x, y, _ = _source_points(
+        image_from_tile, columns, rows, image_size=source.shape[1::-1]
+    )
+    dense = cv2.remap(
+        source,
+        map1=x,
+        map2=y,
+        interpolation=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
     dense = cv2.GaussianBlur(
-        dense, (2 * reach_x + 1, 2 * reach_y + 1), sigma_x, sigmaY=sigma_y
+        dense,
+        ksize=(2 * reach_x + 1, 2 * reach_y + 1),
+        sigmaX=sigma_x,
+        sigmaY=sigma_y,
     )
     rows_end = dense.shape[0] - reach_y
     columns_end = dense.shape[1] - reach_x
@@ -128,7 +144,9 @@ def _compressions(
     columns, rows = (np.linspace(0, extent - 1, SAMPLES_PER_TILE) for extent in size)
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = points[points @ image_from_tile[2, :2] + image_from_tile[2, 2] > 0.0]
-    unit = lafs_from_keypoints(points, np.ones(len(points)), np.zeros(len(points)))
+    unit = lafs_from_keypoints(
+        points, radii_px=np.ones(len(points)), angles_rad=np.zeros(len(points))
+    )
     spans = transform_lafs(image_from_tile, unit)
     seen = is_inside(spans[:, :, 2], image_size)
     return np.asarray(
@@ -146,16 +164,16 @@ def _source_points(
 
     Points further than an image size away are moved there: a border is reflected once.
     """
-    x, y, third = (
+    x, y, depth = (
         form[0] * columns + form[1] * rows[:, None] + form[2]
         for form in image_from_tile
     )
-    ahead = third > 0.0
-    third = np.where(ahead, third, 1.0)
+    is_ahead = depth > 0.0
+    depth = np.where(is_ahead, depth, 1.0)
     width, height = image_size
-    x = np.clip(x / third, -width, 2 * width)
-    y = np.clip(y / third, -height, 2 * height)
-    return x.astype(np.float32), y.astype(np.float32), ahead
+    x = np.clip(x / depth, -width, 2 * width)
+    y = np.clip(y / depth, -height, 2 * height)
+    return x.astype(np.float32), y.astype(np.float32), is_ahead
 
 
 def mask_values(mask: Mask) -> Bytes:
@@ -175,20 +193,32 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Byte
     image_from_region = np.eye(3)
     image_from_region[:2, 2] = rectification.region_origin
     if rectification.is_affine:
-        matrix = (rectification.rectified_from_image @ image_from_region)[:2]
-        size = rectification.canvas_size
+        matrix = rectification.rectified_from_image @ image_from_region
         return np.asarray(
-            cv2.warpAffine(values, matrix, size, flags=cv2.INTER_NEAREST), np.uint8
+            cv2.warpAffine(
+                values,
+                M=matrix[:2],
+                dsize=rectification.canvas_size,
+                flags=cv2.INTER_NEAREST,
+            ),
+            np.uint8,
         )
     mask = np.empty(rectification.canvas_size[::-1], dtype=np.uint8)
     region_from_image = np.linalg.inv(image_from_region)
     for tile, image_from_tile in _tiles(mask, rectification):
         rows, columns = map(np.arange, tile.shape)
         x, y, ahead = _source_points(
-            region_from_image @ image_from_tile, columns, rows, region.shape[::-1]
+            region_from_image @ image_from_tile,
+            columns,
+            rows,
+            image_size=region.shape[::-1],
         )
         inside = cv2.remap(
-            values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            values,
+            map1=x,
+            map2=y,
+            interpolation=cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
         )
         tile[:] = np.where(ahead, inside, 0)
     return mask

@@ -74,7 +74,7 @@ from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
-from colmap_affrect.project.given_h5 import GivenFile, opened
+from colmap_affrect.project.given_h5 import GivenFile, open_given_file
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
 from colmap_affrect.project.stores import (
@@ -85,7 +85,7 @@ from colmap_affrect.project.stores import (
 )
 from colmap_affrect.stages.descriptors import (
     Arrays,
-    matched,
+    iterate_matches,
     unit_rows,
     write_given_matches,
 )
@@ -226,7 +226,7 @@ def _import(
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),
-        opened(features_path) as features,
+        open_given_file(features_path) as features,
     ):
         keys = keys_of(features, names, image_path)
         refuse_colliding_keys(list(keys))
@@ -289,7 +289,7 @@ def _matches(
 
     def matched_pairs(_: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
         try:
-            for pair, matches in matched(pairs, read):
+            for pair, matches in iterate_matches(pairs, read):
                 yield pair, matches.indices
         except OptionError as error:
             raise StoreError(f"{features.path}: {error}") from error

@@ -39,7 +39,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import MatcherOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.mend import watched
+from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
@@ -265,7 +265,7 @@ def match_image_pairs(
 def _described(context: Context) -> list[str]:
     """Return the images with descriptors of a database that no function of ours has filled."""
     workspace = context.workspace
-    if "extract" in workspace.begun or not workspace.database.exists():
+    if "extract" in workspace.started_stages or not workspace.database.exists():
         return []
     return described_images(workspace.database)
 
@@ -532,5 +532,5 @@ def _context(
         as_path(database_path, "database_path")
     ).locked() as workspace:
         context = Context(workspace, resources, executor, progress)
-        with watched(context):
+        with mend_and_seal(context):
             yield context

@@ -40,6 +40,7 @@ def direction_sigmas_deg(
         the others do not exceed. Images of which it is not known are left out.
     """
     image_ids = sorted(model.reg_image_ids())
+    # A limit of time, other than that of focal_observability
     if not 3 <= len(image_ids) <= MAX_NUM_IMAGES:
         return {}
     if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):

@@ -190,6 +190,7 @@ def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
 
 
 def _is_tried(model: pycolmap.Reconstruction) -> bool:
+    # A limit of models, other than sparse.LARGE, which is one of photographs
     return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
 
 

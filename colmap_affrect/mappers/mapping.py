@@ -20,7 +20,7 @@ from colmap_affrect.colmap.model_files import (
     require_intact,
     write_model,
 )
-from colmap_affrect.errors import WorkspaceError, damage, made_again
+from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
 from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, PairGraph, graph_of
@@ -83,7 +83,7 @@ def read_summary(folder: Path) -> ModelSummary:
     StoreError if there is none, or it or the model is damaged: somebody may have edited the model.
     """
     require_intact(folder)
-    again = made_again("map", folder.parent.parent)
+    again = how_to_make_again("map", folder.parent.parent)
     mend = f"if you have edited the model, copy it to a folder of its own; then {again}"
     with damage(folder / SUMMARY, mend):
         return _SUMMARY_FILE.validate_json(read_regular(folder / SUMMARY)).summary

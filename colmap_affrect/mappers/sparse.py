@@ -99,6 +99,9 @@ class SparseMapper(IncrementalMapper):
                 raise KeyboardInterrupt
             show(count)
 
+        # Other limits of a hundred images say other things: how many a model has that
+        # is looked at closely (focal_observability, direction_uncertainty), and how
+        # many come between two snapshots.
         is_small = len(graph.keypoints) < LARGE and not task.extend
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:

@@ -19,7 +19,7 @@ import numpy as np
 from colmap_affrect.errors import OptionError, StoreError, damage, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair, split_line
-from colmap_affrect.project.given_h5 import GivenFile, opened
+from colmap_affrect.project.given_h5 import GivenFile, open_given_file
 from colmap_affrect.project.regular_files import read_regular_text
 
 MatchType = Literal["raw", "inliers"]
@@ -61,7 +61,7 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
     if is_text:
         yield _read_list(path, names)
         return
-    with opened(path) as source:
+    with open_given_file(path) as source:
         yield _of_hdf5(source, names)
 
 

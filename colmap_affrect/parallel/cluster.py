@@ -245,7 +245,7 @@ class Cluster:
             return TASKS_PER_THREAD * self._watch.num_threads()
 
         try:
-            yield from in_order(submit, tasks, num_tasks, self._result)
+            yield from in_order(submit, tasks, limit=num_tasks, result=self._result)
         except KilledWorker as error:
             raise AffrectError(
                 f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "

@@ -145,7 +145,9 @@ def map_ordered(
     try:
         with threadpool_limits(1, user_api="blas"):
             yield from in_order(
-                lambda task: pool.submit(function, task), tasks, lambda: 2 * num_threads
+                lambda task: pool.submit(function, task),
+                tasks,
+                limit=lambda: 2 * num_threads,
             )
     except KeyboardInterrupt:
         is_waited_for = False

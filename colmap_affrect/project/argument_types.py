@@ -3,7 +3,7 @@
 import collections.abc
 import os
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from inspect import signature
 from numbers import Integral, Real
@@ -20,23 +20,14 @@ from typing import (
 
 from colmap_affrect.errors import OptionError
 
-MAX_SHOWN = 60  # characters of a value that is refused; display
-NUMBERS: Mapping[Any, type] = {
-    float: Real,
-    int: Integral,
-}  # numpy's scalars are such, too
-WORDS = (
-    str,
-    bytes,
-)  # sequences of characters, which nobody means by a sequence of names
+MAX_SHOWN = 60  # characters of a value that is refused
+# Numpy's scalars are such, too
+NUMBERS: Mapping[Any, type] = {float: Real, int: Integral}
+# Sequences of characters, which nobody means by a sequence of names
+WORDS = (str, bytes)
 ABSTRACT = "collections.abc"
-LOOKED_INTO = (
-    list,
-    tuple,
-    set,
-    frozenset,
-    dict,
-)  # others may be slow, or gone after one look
+# Collections whose elements are checked; others may be slow, or gone after one look
+LOOKED_INTO = (list, tuple, set, frozenset, dict)
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -54,7 +45,7 @@ def checks_arguments(
         if not kinds:
             kinds.update(get_type_hints(function))
         for name, value in names.bind(*args, **kwargs).arguments.items():
-            require_type(name, value, kinds.get(name, Any))
+            require_type(name, value, kind=kinds.get(name, Any))
         return function(*args, **kwargs)
 
     return checked
@@ -86,7 +77,7 @@ def require_type(name: str, value: Any, kind: Any) -> None:
 def require_bools(**given: Any) -> None:
     """Refuse arguments, by their names, that are neither True nor False."""
     for name, value in given.items():
-        require_type(name, value, bool)
+        require_type(name, value, kind=bool)
 
 
 def _shown(value: Any) -> str:
@@ -99,7 +90,7 @@ def _fits(value: Any, kind: Any) -> bool:
     origin = get_origin(kind)
     inner = get_args(kind)
     if origin in (Union, types.UnionType):
-        return any(_fits(value, one) for one in inner)
+        return any(_fits(value, member) for member in inner)
     if origin is Literal:
         return isinstance(value, str) and value in inner
     if origin is None:
@@ -121,20 +112,27 @@ def _is_instance(value: Any, kind: Any) -> bool:
     if issubclass(kind, os.PathLike):  # as_path says what is no path
         return value is not None
     if getattr(kind, "_is_protocol", False):
-        wanted = [name for name in vars(kind) if not name.startswith("_")]
-        return all(hasattr(value, name) for name in wanted)
-
+        return _has_public_names_of(value, kind)
     if kind in NUMBERS:
         return isinstance(value, NUMBERS[kind]) and not isinstance(value, bool)
     return isinstance(value, kind)
+
+
+def _has_public_names_of(value: Any, protocol: type) -> bool:
+    names = [name for name in vars(protocol) if not name.startswith("_")]
+    return all(hasattr(value, name) for name in names)
 
 
 def _is_tuple(value: Any, inner: tuple[Any, ...]) -> bool:
     if not isinstance(value, tuple | list):
         return False
     if inner and inner[-1] is Ellipsis:
-        return all(_fits(one, inner[0]) for one in value)
+        return _all_fit(value, inner[0])
     return len(value) == len(inner) and all(map(_fits, value, inner))
+
+
+def _all_fit(values: Iterable[Any], kind: Any) -> bool:
+    return all(_fits(value, kind) for value in values)
 
 
 def _holds(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
@@ -143,7 +141,7 @@ def _holds(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
         return False
     if not isinstance(value, LOOKED_INTO) or not inner:
         return True
-    return all(_fits(one, inner[0]) for one in value)
+    return _all_fit(value, inner[0])
 
 
 def _name_of(kind: Any) -> str:
@@ -151,12 +149,13 @@ def _name_of(kind: Any) -> str:
     origin = get_origin(kind)
     inner = get_args(kind)
     if origin in (Union, types.UnionType):
-        return " or ".join(_name_of(one) for one in inner)
+        return " or ".join(map(_name_of, inner))
     if kind is type(None):
         return "None"
     if kind is Ellipsis:
         return "..."
     name = str(getattr(origin or kind, "__name__", kind))
-    if origin and origin.__module__ == "numpy":
+    is_array = origin is not None and origin.__module__ == "numpy"
+    if is_array or not (origin and inner):
         return name
-    return f"{name}[{', '.join(map(_name_of, inner))}]" if origin and inner else name
+    return f"{name}[{', '.join(map(_name_of, inner))}]"

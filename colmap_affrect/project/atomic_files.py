@@ -1,4 +1,10 @@
-"""Files that change as a whole or not at all, also when the program is killed or the disk full."""
+"""Files that change as a whole or not at all, also when the program is killed or the disk full.
+
+Text files are replaced. HDF5 files are too large for that: their changes are first written into a
+second file beside them, the *journal* (``features.h5.journal``). Once it is complete, its changes
+count. They are then put in place, and the journal is removed. A program that is killed meanwhile
+leaves the journal, and the next one that opens the file puts its changes in place.
+"""
 
 import errno
 import hashlib
@@ -9,7 +15,6 @@ import secrets
 import shutil
 import signal
 import struct
-import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -23,9 +28,8 @@ logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096  # format
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
-NEW_SUFFIX = (
-    ".affrect-new"  # of files that are being written; a killed program leaves them
-)
+# Of files that are being written; a killed program leaves them
+NEW_SUFFIX = ".affrect-new"
 JOURNAL_MARK = b"AFFRECT2"
 JOURNAL_HEADER = struct.Struct("<8sQQ")
 """Mark, number of old bytes that stay unless a page changes them, and size of the file; numbered
@@ -92,21 +96,24 @@ def _sync_folder(path: Path) -> None:
 
 
 def require_space(path: Path, num_bytes: int, named: Path | None = None) -> None:
-    """Make sure that there is room for a file of so many bytes beside ``path``.
+    """Make sure that there is room for a file beside ``path``.
 
-    For files that are written by libraries which do not survive a full disk: else WorkspaceError,
-    which may name another file for which the room is needed.
+    This is for files that are written by libraries which do not survive a full disk.
+
+    Args:
+        path: beside which the file will be.
+        num_bytes: that it will have.
+        named: file that an error names, for which the room is needed; None: ``path``.
+
+    Raises:
+        WorkspaceError: there is no room.
     """
     try:
         if shutil.disk_usage(path.parent).free < num_bytes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        with (
-            _new_beside(path) as (file, _),
-            suppress(AttributeError),
-        ):  # not on all systems
-            os.posix_fallocate(
-                file.fileno(), 0, num_bytes
-            )  # which a quota may not allow
+        # A quota may not allow it. Not all systems have the function.
+        with _new_beside(path) as (file, _), suppress(AttributeError):
+            os.posix_fallocate(file.fileno(), 0, num_bytes)
     except OSError as error:
         raise cannot_write(named or path, error) from error
 
@@ -141,27 +148,27 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    put_off: list[int] = []
-    handlers = {
-        number: signal.signal(number, lambda number, _: put_off.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    postponed: list[int] = []
+
+    def postpone(number: int, _: object) -> None:
+        postponed.append(number)
+
+    handler_of_interrupt = signal.signal(signal.SIGINT, postpone)
+    handler_of_end = signal.signal(signal.SIGTERM, postpone)
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-        for again in dict.fromkeys(put_off):
-            signal.raise_signal(again)
+        signal.signal(signal.SIGINT, handler_of_interrupt or signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, handler_of_end or signal.SIG_DFL)
+        for number in dict.fromkeys(postponed):
+            signal.raise_signal(number)
 
 
 class FileTransaction(io.RawIOBase):
     """A binary file for h5py, whose changes stay in memory until :meth:`commit` makes them all.
 
-    One that is not there is made by the first commit.
-
-    Changed pages go into a journal beside the file; once that is complete, the changes count, and
-    :func:`apply_journal` puts them in place, now or when the file is next opened.
+    One that is not there is made by the first commit. Changed pages go into a journal beside the
+    file, see :mod:`colmap_affrect.project.atomic_files`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -169,12 +176,21 @@ class FileTransaction(io.RawIOBase):
         apply_journal(path)
         self._path = path
         self._stored = open_regular(path) if path.exists() else io.BytesIO()
-        self._kept_size = self._size = self._stored.seek(0, os.SEEK_END)
+        self._size = self._stored.seek(0, os.SEEK_END)
+        self._kept_size = self._size  # bytes of the stored file that still count
         self._position = 0
         self._pages: dict[int, bytearray] = {}
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """See :class:`io.RawIOBase`."""
+        """Move to another position, as :class:`io.RawIOBase`.
+
+        Args:
+            offset: bytes from where ``whence`` says.
+            whence: ``os.SEEK_SET``, ``os.SEEK_CUR`` or ``os.SEEK_END``.
+
+        Returns:
+            The new position, bytes from the beginning.
+        """
         starts = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}
         self._position = starts[whence] + offset
         return self._position
@@ -208,13 +224,12 @@ class FileTransaction(io.RawIOBase):
         """Change the size, as :class:`io.RawIOBase`."""
         self._size = self._position if size is None else size
         self._kept_size = min(self._kept_size, self._size)
-        for number in [
-            number for number in self._pages if number * PAGE_BYTES >= self._size
-        ]:
-            del self._pages[number]
-        if (last := self._size // PAGE_BYTES) in self._pages:
-            rest = self._size % PAGE_BYTES
-            self._pages[last][rest:] = bytes(PAGE_BYTES - rest)
+        for number in list(self._pages):
+            if number * PAGE_BYTES >= self._size:
+                del self._pages[number]
+        last, num_left = divmod(self._size, PAGE_BYTES)
+        if last in self._pages:
+            self._pages[last][num_left:] = bytes(PAGE_BYTES - num_left)
         return self._size
 
     def close(self) -> None:
@@ -224,12 +239,11 @@ class FileTransaction(io.RawIOBase):
 
     def commit(self) -> None:
         """Make all changes; OSError when they cannot be written: what is in the journal counts."""
-        header = JOURNAL_HEADER.pack(JOURNAL_MARK, self._kept_size, self._size)
-        pages = (
+        content = JOURNAL_HEADER.pack(JOURNAL_MARK, self._kept_size, self._size)
+        content += b"".join(
             struct.pack("<Q", number) + page
             for number, page in sorted(self._pages.items())
         )
-        content = header + b"".join(pages)
         _replace(journal_of(self._path), [content, hashlib.sha256(content).digest()])
         apply_journal(self._path)
 
@@ -263,20 +277,30 @@ def apply_journal(path: Path) -> None:
         return
     whole = read_regular(journal)
     content = whole[:-SHA256_BYTES]
-    digest = whole[-SHA256_BYTES:]
-    kept_size = size = sys.maxsize
-    if hashlib.sha256(content).digest() == digest and content.startswith(JOURNAL_MARK):
-        _, kept_size, size = JOURNAL_HEADER.unpack_from(content)
-    if kept_size <= (path.stat().st_size if path.exists() else 0):
-        path.touch()
-        with path.open("r+b") as file:
-            file.truncate(kept_size)
-            for start in range(JOURNAL_HEADER.size, len(content), 8 + PAGE_BYTES):
-                (number,) = struct.unpack_from("<Q", content, start)
-                file.seek(number * PAGE_BYTES)
-                file.write(content[start + 8 : start + 8 + PAGE_BYTES])
-            file.truncate(size)
-            _sync(file)
+    is_complete = hashlib.sha256(content).digest() == whole[-SHA256_BYTES:]
+    if is_complete and content.startswith(JOURNAL_MARK) and _belongs_to(path, content):
+        _apply_changes(path, content)
     else:
         logger.warning("%s: does not count; the changes in it are left out", journal)
     journal.unlink()
+
+
+def _belongs_to(path: Path, content: bytes) -> bool:
+    """Tell whether a file has the bytes that a journal leaves as they are."""
+    _, kept_size, _ = JOURNAL_HEADER.unpack_from(content)
+    size = path.stat().st_size if path.exists() else 0
+    return bool(kept_size <= size)
+
+
+def _apply_changes(path: Path, content: bytes) -> None:
+    """Write the pages of a journal into its file, which is made if it is missing."""
+    _, kept_size, size = JOURNAL_HEADER.unpack_from(content)
+    path.touch()
+    with path.open("r+b") as file:
+        file.truncate(kept_size)
+        for start in range(JOURNAL_HEADER.size, len(content), 8 + PAGE_BYTES):
+            (number,) = struct.unpack_from("<Q", content, start)
+            file.seek(number * PAGE_BYTES)
+            file.write(content[start + 8 : start + 8 + PAGE_BYTES])
+        file.truncate(size)
+        _sync(file)

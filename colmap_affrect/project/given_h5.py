@@ -34,19 +34,32 @@ class GivenFile:
     def groups_with(self, dataset: str) -> list[str]:
         """Return the sorted paths of the groups that have a dataset."""
         ending = f"/{dataset}"
-        found = sorted(
-            key.removesuffix(ending) for key in self.shapes if key.endswith(ending)
-        )
-        if self.shapes and not found:
+        groups = []
+        for key in self.shapes:
+            if key.endswith(ending):
+                groups.append(key.removesuffix(ending))
+        if self.shapes and not groups:
             raise StoreError(
                 f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?"
             )
-        return found
+        return sorted(groups)
 
     def read(
         self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu"
     ) -> NDArray[Any]:
-        """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
+        """Read an array of numbers.
+
+        Args:
+            key: path of the dataset.
+            shape: that it must have; None is any size.
+            kinds: numpy's kinds of numbers that it may hold.
+
+        Returns:
+            The array.
+
+        Raises:
+            StoreError: it is damaged, or holds something else.
+        """
         stored = self.shapes[key]
         expected = tuple(stored[:1]) if shape[0] is None else shape[:1]
         if stored != expected + shape[1:]:
@@ -71,7 +84,7 @@ class GivenFile:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[GivenFile]:
+def open_given_file(path: Path) -> Iterator[GivenFile]:
     """Open a file for reading; of links nothing is seen, data that are elsewhere are refused."""
     if not path.is_file():
         raise OptionError(f"{path}: no such file")
@@ -94,4 +107,4 @@ def opened(path: Path) -> Iterator[GivenFile]:
         except SystemError as error:  # h5py's, for a name that is no UTF-8
             raise ValueError(error) from error
     with file:
-        yield GivenFile(path, file, shapes)
+        yield GivenFile(path=path, file=file, shapes=shapes)

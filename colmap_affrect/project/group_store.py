@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import StoreError, damage, made_again
+from colmap_affrect.errors import StoreError, damage, how_to_make_again
 from colmap_affrect.project import atomic_files
 from colmap_affrect.project.regular_files import require_regular
 
@@ -34,14 +34,14 @@ class GroupStore:
         between two of its writes leaves a file that cannot be read.
         """
         if mode == "r":
-            with self._opened(self.path, "r") as file:
+            with self._open_file(self.path, "r") as file:
                 yield file
             return
         with (
             atomic_files.uninterrupted(),
             atomic_files.FileTransaction(self.path) as changes,
         ):
-            with self._opened(changes, "r+" if self.path.exists() else "w") as file:
+            with self._open_file(changes, "r+" if self.path.exists() else "w") as file:
                 yield file
             try:
                 changes.commit()
@@ -49,17 +49,18 @@ class GroupStore:
                 raise atomic_files.cannot_write(self.path, error) from error
 
     @contextmanager
-    def _opened(
+    def _open_file(
         self, where: Path | atomic_files.FileTransaction, mode: str
     ) -> Iterator[h5py.File]:
-        mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
-        with damage(self.path, mend):
+        advice = how_to_make_again(self.stage, self.path.parent)
+        with damage(self.path, f"unless another program has it open, {advice}"):
             atomic_files.apply_journal(self.path)
             require_regular(self.path)
             with h5py.File(where, mode) as file:
                 if mode == "w":
                     file.attrs.update(format=self.format, pixel_origin="center")
-                if (found := file.attrs.get("format")) != self.format:
+                found = file.attrs.get("format")
+                if found != self.format:
                     raise StoreError(
                         f"{self.path}: expected the format {self.format}, found {found}; use "
                         "another --output-path"
@@ -72,7 +73,7 @@ class GroupStore:
             with self._open("r") as file:
                 for _, group in entries_of(file):
                     for name in group:  # items() has None for what cannot be opened
-                        checked(group, name)
+                        read_checked(group, name)
 
     @classmethod
     def _write(
@@ -92,11 +93,12 @@ class GroupStore:
         group.create_dataset(name, data=values).attrs[CHECKSUM] = _checksum(values)
 
 
-def checked(group: h5py.Group, name: str) -> NDArray[Any]:
+def read_checked(group: h5py.Group, name: str) -> NDArray[Any]:
     """Read a dataset; ValueError if it does not hold what was written."""
     dataset = group[name]
     values = np.asarray(dataset[()])
-    if dataset.attrs.get(CHECKSUM, known := _checksum(values)) != known:
+    checksum = _checksum(values)
+    if dataset.attrs.get(CHECKSUM, checksum) != checksum:
         raise ValueError(f"{dataset.name} is not as it was written")
     return values
 

@@ -114,5 +114,10 @@ def lines_from_datasets(datasets: Mapping[str, NDArray[Any]]) -> Lines | None:
     log_likelihoods = datasets[LIKELIHOODS].astype(np.float64)
     if log_likelihoods.shape != (len(FOCALS), len(SHIFTS)):
         return None
-    rotations = datasets[ROTATIONS].astype(np.float64)
-    return Lines(segments, LineLikelihood(log_likelihoods, rotations))
+    return Lines(
+        segments,
+        LineLikelihood(
+            log_likelihoods=log_likelihoods,
+            rotations=datasets[ROTATIONS].astype(np.float64),
+        ),
+    )

@@ -83,13 +83,12 @@ class MatchState:
 
         Of images that have gone nothing is left; others may get their names.
         """
-        backgrounds = tuple(
-            known for known in self.backgrounds if known[0] not in images
-        )
         return MatchState(
             stationary=self.stationary,
             still_cameras=self.still_cameras,
-            backgrounds=backgrounds,
+            backgrounds=tuple(
+                (name, cells) for name, cells in self.backgrounds if name not in images
+            ),
             effort=self.effort,
         )
 

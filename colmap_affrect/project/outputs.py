@@ -30,17 +30,16 @@ from colmap_affrect.project.regular_files import (
 
 RESULTS = "results"  # folder of these in such a folder, whose names are the user's
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
+# Files of ours begin so
 MARKS = {
     "config.toml": b"format_version",
     "run.log": b"colmap-affrect",
-}  # files of ours begin so
-LONGEST_NAME = 255  # bytes that file systems take; format
-MAX_NAME_BYTES = (
-    LONGEST_NAME - 35
-)  # there has to be room for what is beside it meanwhile; format
-# A disk with less room may have cut off what was written last; resource
-SPARE_BYTES = 1 << 16
-BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are; format
+}
+LONGEST_NAME = 255  # bytes that file systems take
+# There has to be room for the longer names of what is beside it meanwhile
+MAX_NAME_BYTES = LONGEST_NAME - 35
+SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
+BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
 
 
@@ -78,7 +77,8 @@ def refuse_photographs(target: Path, names: Collection[str]) -> None:
     Work folders of ours are allowed: the search for photographs skips them. Raises OptionError.
     """
     inner = [name for name in names if not leads_outside(name)]
-    for folder in resolved(target.parent), *resolved(target.parent).parents:
+    parent = resolved(target.parent)
+    for folder in (parent, *parent.parents):
         if not inner or is_output_folder(folder):
             return
         with suppress(OSError):  # a name that is too long, for one
@@ -113,47 +113,63 @@ def new_results(
     """
     for target in targets:
         refuse_link(target)
-        if any(
-            p.name == "sparse" and is_output_folder(p.parent) for p in target.parents
-        ):
+        _refuse_models_of_a_run(target)
+        refuse_photographs(target, names)
+    if not replaces:
+        _refuse_existing(targets)
+    with ExitStack() as stack:
+        folders = dict[Path, Path]()
+        for target in targets:
+            if target.parent not in folders:
+                folder = stack.enter_context(temporary_folder(target.parent))
+                folders[target.parent] = _new_results_folder(folder)
+        made = [folders[target.parent] / target.name for target in targets]
+        yield made
+        for target in targets:  # native writers say nothing of a full disk
+            require_space(
+                folders[target.parent].with_name("rest"),
+                num_bytes=SPARE_BYTES,
+                named=target,
+            )
+        with uninterrupted():
+            if not replaces:  # somebody may have made one meanwhile
+                _refuse_existing(targets)
+            for path, target in zip(made, targets, strict=True):
+                _move(path, target)
+
+
+def _new_results_folder(parent: Path) -> Path:
+    """Make the folder of the results; what is beside it may have any name."""
+    folder = parent / RESULTS
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise cannot_write(parent, error) from error
+    return folder
+
+
+def _move(path: Path, target: Path) -> None:
+    try:
+        path.replace(target)
+    except OSError as error:
+        raise cannot_write(target, error) from error
+
+
+def _refuse_models_of_a_run(target: Path) -> None:
+    for folder in target.parents:
+        if folder.name == "sparse" and is_output_folder(folder.parent):
             raise OptionError(
                 f"{target}: lies beside the models of a run, which mapping removes; give another "
                 "name or folder"
             )
-        refuse_photographs(target, names)
-        if not replaces:
-            _refuse_existing(target)
-    with ExitStack() as stack:
-        parents = dict.fromkeys(target.parent for target in targets)
-        folders = {
-            parent: stack.enter_context(temporary_folder(parent)) for parent in parents
-        }
-        for temporary in folders.values():  # what is beside it may have any name
-            try:
-                (temporary / RESULTS).mkdir()
-            except OSError as error:
-                raise cannot_write(temporary, error) from error
-        made = [folders[target.parent] / RESULTS / target.name for target in targets]
-        yield made
-        for target in targets:  # native writers say nothing of a full disk
-            require_space(folders[target.parent] / "rest", SPARE_BYTES, target)
-        with uninterrupted():
-            for target in (
-                () if replaces else targets
-            ):  # somebody may have made one meanwhile
-                _refuse_existing(target)
-            try:
-                for path, target in zip(made, targets, strict=True):
-                    path.replace(target)
-            except OSError as error:
-                raise cannot_write(target, error) from error
 
 
-def _refuse_existing(target: Path) -> None:
-    if os.path.lexists(target):
-        raise OptionError(
-            f"{target}: exists, and is left as it is; give another name or folder"
-        )
+def _refuse_existing(targets: Iterable[Path]) -> None:
+    for target in targets:
+        if os.path.lexists(target):
+            raise OptionError(
+                f"{target}: exists, and is left as it is; give another name or folder"
+            )
 
 
 @contextmanager
@@ -194,13 +210,8 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 def database_files(path: Path) -> list[Path]:
     """Return a database of SQLite and the files that it may have beside it."""
-    return [
-        path,
-        *(
-            path.with_name(path.name + suffix)
-            for suffix in ("-wal", "-shm", "-journal")
-        ),
-    ]
+    suffixes = ("", "-wal", "-shm", "-journal")
+    return [path.with_name(path.name + suffix) for suffix in suffixes]
 
 
 def remove_own(paths: Iterable[Path]) -> None:
@@ -223,6 +234,14 @@ def remove_own(paths: Iterable[Path]) -> None:
 
 def fitting_name(stem: str, suffix: str, most: int = MAX_NAME_BYTES) -> str:
     """Return the name of a file; where file systems take none so long, its beginning and a digest.
+
+    Args:
+        stem: of the name.
+        suffix: of the name, with its point.
+        most: bytes that the name may have.
+
+    Returns:
+        A name of at most as many bytes.
 
     >>> fitting_name("a", ".png"), len(fitting_name("b" * 300, ".png"))
     ('a.png', 220)

@@ -24,9 +24,8 @@ class Content(NamedTuple):
     """What files hold."""
 
     digest: str = ""  # sha256 of the digests of the files; empty if not known
-    stamp: str = (
-        ""  # their sizes and times: while these stay, nobody has to read the files
-    )
+    # Their sizes and times: while these stay, nobody has to read the files
+    stamp: str = ""
 
 
 def file_sha256(path: Path) -> str:
@@ -85,9 +84,8 @@ STAGES: tuple[str, ...] = get_args(Stage)
 MAX_VALUE = 160
 FORMAT_VERSION = 13  # counts up when a stage records other options than before; format
 MADE_FROM = "made_from"  # digests of given files
-MAPPED = (
-    "mapped"  # what the models that are there were made from, and how many they are
-)
+# What the models that are there were made from, and how many they are
+MAPPED = "mapped"
 PLANNED = "planned"  # options of stages that have not begun
 KEYS = ("recipe", *STAGES, PLANNED, MADE_FROM, MAPPED)
 
@@ -102,7 +100,7 @@ OF_DATABASE = {"extract": ("cameras",)}
 """Options of a stage that decide only on the database, which others make anew."""
 
 
-class MappedFrom(NamedTuple):
+class ModelInputs(NamedTuple):
     """What models were made from."""
 
     verified: str  # digest of the database
@@ -113,7 +111,7 @@ class MappedFrom(NamedTuple):
 OWN = "own"  # a model of the folder itself is extended
 
 
-class Mapped(BaseModel):
+class MappingRecord(BaseModel):
     """The models that are there."""
 
     model_config = ConfigDict(extra="forbid")
@@ -123,9 +121,11 @@ class Mapped(BaseModel):
     number: int
 
     @property
-    def made_from(self) -> MappedFrom:
+    def inputs(self) -> ModelInputs:
         """What they were made from."""
-        return MappedFrom(self.verified, self.by_hand, self.extends)
+        return ModelInputs(
+            verified=self.verified, by_hand=self.by_hand, extends=self.extends
+        )
 
 
 class _Record(BaseModel):
@@ -134,7 +134,7 @@ class _Record(BaseModel):
     recipe: str = ""
     planned: dict[Stage, dict[str, Any]] = {}
     made_from: dict[str, str] = {}
-    mapped: Mapped | None = None
+    mapped: MappingRecord | None = None
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def read_record(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     other = f"use another --output-path than {path.parent}"
-    with damage(path, f"restore it, or {other}", WorkspaceError):
+    with damage(path, mend=f"restore it, or {other}", error_class=WorkspaceError):
         values = tomllib.loads(read_regular_text(path))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
@@ -153,12 +153,13 @@ def read_record(path: Path) -> dict[str, Any]:
                 "gone on with; use another --output-path or remove it"
             )
         record = _Record(**values).model_dump(exclude_unset=True)
-        if unknown := record.keys() - set(KEYS):
+        unknown = record.keys() - set(KEYS)
+        if unknown:
             raise ValueError(f"unknown {min(unknown)!r}")
     return record
 
 
-def rewound(record: Mapping[str, Any], stage: str) -> dict[str, Any]:
+def rewind_record(record: Mapping[str, Any], stage: str) -> dict[str, Any]:
     """Return a record in which a stage and those after it are only planned, with their options."""
     planned = dict(record.get(PLANNED, {}))
     kept = dict(record)
@@ -191,17 +192,23 @@ def first_difference(
     """
     old = flat({key: value for key, value in known.items() if key not in free})
     new = flat({key: value for key, value in now.items() if key not in free})
-    # The name of a part first: with another one most other options differ too.
-    for key in sorted(
-        old.keys() | new.keys(), key=lambda k: (k.rpartition(".")[2] != "name", k)
-    ):
+    for key in sorted(old.keys() | new.keys(), key=_part_names_first):
         before = old.get(key)
         after = new.get(key)
-        if key.startswith(f"{WEIGHTS}.") and not (
-            before and after
-        ):  # of a level that waits
-            continue
-        if before != after and not (key in PLACES and before and after):
+        if before != after and not _may_differ(key, before, after):
             was = clipped(repr(before), MAX_VALUE)
             return f"{key}={was}, and it is {clipped(repr(after), MAX_VALUE)} now"
     return ""
+
+
+def _part_names_first(key: str) -> tuple[bool, str]:
+    """Return by what options are sorted: with another part most other options differ, too."""
+    return key.rpartition(".")[2] != "name", key
+
+
+def _may_differ(key: str, before: object, after: object) -> bool:
+    """Tell whether results stay the same though an option has another value."""
+    has_both = bool(before and after)
+    if key.startswith(f"{WEIGHTS}."):
+        return not has_both  # a level waits for its weights
+    return key in PLACES and has_both

@@ -19,11 +19,10 @@ KINDS = {
     stat.S_IFBLK: "a device",
 }
 """What else may have the name of a file, by its type."""
-CHUNK_BYTES = 1 << 20  # of a file that are in memory while it is digested; resource
-MAX_TEXT_BYTES = 1 << 30  # of lists, tables and options; damage
-NEVER_WAITS = getattr(os, "O_NONBLOCK", 0) | getattr(
-    os, "O_BINARY", 0
-)  # neither is everywhere
+CHUNK_BYTES = 1 << 20  # of a file that are in memory while it is digested
+MAX_TEXT_BYTES = 1 << 30  # of lists, tables and options
+# Neither flag is on all systems
+NEVER_WAITS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 class NotAFileError(OSError):
@@ -76,10 +75,12 @@ def sha256_of_regular(path: Path) -> str:
     """Return the SHA-256 of what a regular file holds, in hexadecimal digits, as read there."""
     digest = hashlib.sha256()
     with open_regular(path) as file:
-        left = os.fstat(file.fileno()).st_size
-        while chunk := file.read(min(left, CHUNK_BYTES)):
+        num_left = os.fstat(file.fileno()).st_size
+        chunk = file.read(min(num_left, CHUNK_BYTES))
+        while chunk:
             digest.update(chunk)
-            left -= len(chunk)
+            num_left -= len(chunk)
+            chunk = file.read(min(num_left, CHUNK_BYTES))
     return digest.hexdigest()
 
 

@@ -4,18 +4,19 @@ import json
 import math
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
-NUM_WORST = 3  # tie points that a summary names; display
-MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all; display
+NUM_WORST = 3  # tie points that a summary names
+MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size",
@@ -24,11 +25,11 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
     "registered_names", "probabilities", "unsure", "doubtful", "mean_track_length",
-    "mean_reprojection_error_px", "hypotheses", "one_view",
+    "mean_reprojection_error_px", "moves", "one_view",
 )  # fmt: skip
 
-SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other; theory
-MOST_CERTAIN = 0.999  # nothing is more probable than that; theory
+SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
+MOST_CERTAIN = 0.999  # nothing is more probable than that
 
 
 def kept_probability(probability: float) -> float:
@@ -52,14 +53,6 @@ def probability_text(probability: float) -> str:
     return ">99%" if percent >= 99 and probability > 0.99 else f"{percent}%"
 
 
-CONTRADICTED: Mapping[str, tuple[Sequence[str], str, str]] = {
-    "EXIF": (("exif", "exif-rescaled"), "by EXIF", "--ignore-exif leaves it out"),
-    "the given focal length": (("given",), "given", "--cameras-path takes another one"),
-}
-"""What may be wrong of a camera: its sources, where its number is from, and what helps. What the
-user gives is usually held; that of a database only has a prior."""
-# Of a focal length: three standard deviations of what EXIF usually has; theory
-MAX_EXIF_ERROR = 1.27
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 REPORTED_PACKAGES = (
@@ -81,77 +74,11 @@ def installed_versions() -> dict[str, str]:
 
 def _some(lines: Iterable[str]) -> list[str]:
     """Return the first few lines of a list, and how many there are more."""
-    shown = list(lines)
-    if (more := len(shown) - MAX_LINES) > 1:
-        shown[MAX_LINES:] = [f"            and {more} more, see report.json"]
-    return shown
-
-
-def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say where a model contradicts what was known of cameras, and what would tell lenses in mm.
-
-    Args:
-        cameras: entries of ``report.json``.
-    """
-    notes = []
-    for what, (sources, by, remedy) in CONTRADICTED.items():
-        wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
-        if wrong:
-            first = wrong[0]
-            more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-            notes.append(
-                f"{what} may be wrong: {first['focal_px']:.0f} px {by}, "
-                f"{first['refined_px']:.0f} px in the model{more}; {remedy}"
-            )
-    lenses_mm = sorted(
-        {camera["lens_mm"] for camera in cameras if camera.get("lens_mm")}
-    )
-    shared = [camera for camera in cameras if _is_found(camera)]
-    num_found = len({camera["refined_px"] for camera in shared})
-    if num_found < len(shared):
-        notes.append(
-            f"of those not known mapping makes {num_found}: photographs of one size share one"
-        )
-    if lenses_mm:
-        notes.append(
-            f"EXIF has {', '.join(f'{mm:g}' for mm in lenses_mm[:3])} mm, and not the size of the "
-            f"sensor: --focal-mm {lenses_mm[0]:g} --film-width-mm WIDTH (its longer side) tells "
-            "the focal length"
-        )
-    return notes
-
-
-def as_mapped(cameras: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return cameras, with those that mapping has made one as one, with all their photographs.
-
-    Args:
-        cameras: entries of ``report.json``.
-    """
-    found: dict[object, Mapping[str, Any]] = {}
-    for number, camera in enumerate(cameras):
-        key: object = number
-        if _is_found(camera):
-            key = camera["refined_px"], camera["focal_px"], camera["why"]
-        names = (
-            [*found[key]["names"], *camera["names"]]
-            if key in found
-            else camera["names"]
-        )
-        found[key] = {**camera, "names": names}
-    return list(found.values())
-
-
-def _is_found(camera: Mapping[str, Any]) -> bool:
-    """Return whether nothing but the model tells the focal length of a camera."""
-    return camera["source"] == "guess" and bool(camera.get("refined_px"))
-
-
-def _is_contradicted(camera: Mapping[str, Any], sources: Sequence[str]) -> bool:
-    """Tell whether a model is far from a focal length that is known from one of some sources."""
-    if camera["source"] not in sources or not camera.get("refined_px"):
-        return False
-    ratio = camera["refined_px"] / camera["focal_px"]
-    return not 1 / MAX_EXIF_ERROR <= ratio <= MAX_EXIF_ERROR
+    listed = list(lines)
+    num_more = len(listed) - MAX_LINES
+    if num_more <= 1:
+        return listed
+    return [*listed[:MAX_LINES], f"            and {num_more} more, see report.json"]
 
 
 def by_story(stories: Mapping[str, str]) -> list[str]:
@@ -223,14 +150,16 @@ class StageReport(Summarized):
         return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
 
 
-def summed(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
+def sum_by_stage(reports: Iterable[StageReport]) -> tuple[StageReport, ...]:
     """Return one report of each stage, in the order in which they began: the last, all seconds."""
     found = dict[str, StageReport]()
     for report in reports:
         before = found.get(report.name, replace(report, wall_s=0.0, num_done=0))
-        wall_s = before.wall_s + report.wall_s
-        num_done = before.num_done + report.num_done
-        found[report.name] = replace(report, wall_s=wall_s, num_done=num_done)
+        found[report.name] = replace(
+            report,
+            wall_s=before.wall_s + report.wall_s,
+            num_done=before.num_done + report.num_done,
+        )
     return tuple(found.values())
 
 
@@ -266,6 +195,10 @@ class Residual:
     error_px: float
     """Distance from the mark to where the model sees the point."""
 
+    def text(self) -> str:
+        """Return a few words."""
+        return f"{self.point} in {self.image} {self.error_px:.1f}"
+
 
 @documented
 @dataclass(frozen=True)
@@ -294,7 +227,7 @@ class ModelSummary:
     """Why images that were surely wrong were taken out."""
     focals_px: dict[str, float] = field(default_factory=dict)
     """Focal length of the camera of each image."""
-    hypotheses: tuple[str, ...] = ()
+    moves: tuple[str, ...] = ()
     """What made the model, by the sparse mapper."""
     tie_points: tuple[Residual, ...] = ()
     """Residuals of the tie points by hand, the worst first."""
@@ -304,9 +237,8 @@ class ModelSummary:
     @property
     def sure(self) -> tuple[str, ...]:
         """Names of the images that are right with a probability of ``SURE`` or more."""
-        return tuple(
-            name for name, share in self.probabilities.items() if share >= SURE
-        )
+        probabilities = self.probabilities.items()
+        return tuple(name for name, probability in probabilities if probability >= SURE)
 
     @property
     def likely(self) -> set[str]:
@@ -315,22 +247,16 @@ class ModelSummary:
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines = _some(
-            f"joined      {name} {one.text()}" for name, one in self.bridges.items()
-        )
-        lines += _some(
-            f"unsure      {line}" for line in by_story(texts_of(self.unsure))
-        )
-        lines += _some(
-            f"doubtful    {line}" for line in by_story(texts_of(self.doubtful))
-        )
-        alike = (
-            f"one view    {a} and {b}: no depth between them" for a, b in self.one_view
-        )
-        lines += _some(alike)
+        bridges = self.bridges.items()
+        unsure = by_story(texts_of(self.unsure))
+        doubtful = by_story(texts_of(self.doubtful))
+        alike = [f"{first} and {second}" for first, second in self.one_view]
         return [
             f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
-            *lines,
+            *_some(f"joined      {name} {bridge.text()}" for name, bridge in bridges),
+            *_some(f"unsure      {line}" for line in unsure),
+            *_some(f"doubtful    {line}" for line in doubtful),
+            *_some(f"one view    {pair}: no depth between them" for pair in alike),
             *self._tie_point_lines(),
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",
@@ -339,13 +265,20 @@ class ModelSummary:
     def _tie_point_lines(self) -> list[str]:
         if not self.tie_points:
             return []
-        worst = self.tie_points[:NUM_WORST]
-        texts = [f"{one.point} in {one.image} {one.error_px:.1f}" for one in worst]
-        num_points = len({one.point for one in self.tie_points})
+        worst = ", ".join(residual.text() for residual in self.tie_points[:NUM_WORST])
+        num_points = len({residual.point for residual in self.tie_points})
+        num_marks = len(self.tie_points)
         return [
-            f"tie points  {num_points}, {len(self.tie_points)} marks; farthest off in px: "
-            f"{', '.join(texts)}"
+            f"tie points  {num_points}, {num_marks} marks; farthest off in px: {worst}"
         ]
+
+
+NO_MODEL = ModelSummary(
+    registered_names=(),
+    num_points3D=0,
+    mean_track_length=0.0,
+    mean_reprojection_error_px=0.0,
+)
 
 
 @documented
@@ -427,10 +360,10 @@ class ReconstructionReport(Summarized):
     @property
     def added(self) -> tuple[str, ...]:
         """Names of the images that came into the model that was extended."""
+        if not self.extended:
+            return ()
         before = set(self.extended)
-        return tuple(
-            name for name in self.registered_names if before and name not in before
-        )
+        return tuple(name for name in self.registered_names if name not in before)
 
     @property
     def failures(self) -> dict[str, str]:
@@ -448,25 +381,23 @@ class ReconstructionReport(Summarized):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
-        largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+        largest = self.models[0] if self.models else NO_MODEL
+        of_largest = asdict(largest)
         found = asdict(self)
         del found["verification"]["random_seed"]
         options = found["mapping"]
+        missing = {name: why.to_mapping() for name, why in self.unregistered.items()}
         return {
             "status": self.status,
             "images_registered": len(largest.registered_names),
-            **{key: getattr(largest, key) for key in OF_LARGEST},
+            **{key: of_largest[key] for key in OF_LARGEST},
             **found,
-            "unregistered": {
-                name: why.to_mapping() for name, why in self.unregistered.items()
-            },
+            "unregistered": missing,
             "unsure": mappings_of(largest.unsure),
             "doubtful": mappings_of(largest.doubtful),
             "points3D": largest.num_points3D,
-            "bridges": {
-                name: asdict(bridge) for name, bridge in largest.bridges.items()
-            },
-            "tie_points": [asdict(residual) for residual in largest.tie_points],
+            "bridges": of_largest["bridges"],
+            "tie_points": list(of_largest["tie_points"]),
             "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
             "added": self.added,
@@ -481,57 +412,82 @@ class ReconstructionReport(Summarized):
 
     def summary(self, *, with_warnings: bool = True) -> str:
         """Return one screen of text."""
-        registered = len(self.registered_names)
-        lines = [f"registered  {registered} of {self.images_total} images"]
-        if self.extended:
-            lines += [
-                f"extended    {len(self.extended)} were there, {len(self.added)} came in"
-            ]
-            lines += [f"            new {name}" for name in self.added]
+        num_registered = len(self.registered_names)
+        lines = [
+            f"registered  {num_registered} of {self.images_total} images",
+            *self._extension_lines(),
+            *self._missing_lines(),
+            f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified",
+            *_some(f"by hand     {text}" for text in self.by_hand),
+            *self._matching_lines(),
+            *self._camera_lines(),
+            *self._model_lines(),
+            *self._preset_lines(),
+        ]
+        if with_warnings:
+            warnings = self.warnings.items()
+            lines += _some(f"warning     {name}: {why}" for name, why in warnings)
+        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
+        lines.append(f"seconds     {seconds}")
+        for advice in self.advice[:MAX_ADVICE]:
+            texts = filter(None, (advice.why, advice.command))
+            lines.append("try         " + "\n            ".join(texts))
+        return "\n".join(lines)
+
+    def _extension_lines(self) -> list[str]:
+        if not self.extended:
+            return []
+        num_before = len(self.extended)
+        return [
+            f"extended    {num_before} were there, {len(self.added)} came in",
+            *[f"            new {name}" for name in self.added],
+        ]
+
+    def _missing_lines(self) -> list[str]:
         missing = {name: why.text() for name, why in self.unregistered.items()}
-        lines += _some(f"        not {line}" for line in by_story(missing))
-        lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        lines += _some(f"by hand     {text}" for text in self.by_hand)
+        return _some(f"        not {line}" for line in by_story(missing))
+
+    def _matching_lines(self) -> list[str]:
+        """Return what guided matching and escalation have done."""
+        lines = []
         if self.guided:
+            num_pairs = self.guided["pairs"]
+            pairs = "pair" if num_pairs == 1 else "pairs"
             before = self.guided["matches_before"]
             after = self.guided["matches_after"]
-            pairs = (
-                f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
+            lines.append(
+                f"guided      {num_pairs} {pairs} matched again: {after} inliers, "
+                f"{before} before"
             )
-            lines += [
-                f"guided      {pairs} matched again: {after} inliers, {before} before"
-            ]
         if self.matched_again:
-            texts = [one.text() for one in self.matched_again]
-            lines += [f"again       {', '.join(texts)} (effort {self.effort})"]
-        if self.cameras:
-            sources = Counter(
-                str(camera["source"]) for camera in self.cameras
-            ).most_common()
-            texts = [
-                f"{count} {SOURCES.get(source, source)}" for source, count in sources
-            ]
-            lines += [f"cameras     focal lengths: {', '.join(texts)}"]
-            lines += [f"            {note}" for note in camera_notes(self.cameras)]
-        if self.models:
-            lines += self.models[0].summary_lines()
+            texts = ", ".join(again.text() for again in self.matched_again)
+            lines.append(f"again       {texts} (effort {self.effort})")
+        return lines
+
+    def _camera_lines(self) -> list[str]:
+        """Return where focal lengths are from, and what may be wrong of them."""
+        if not self.cameras:
+            return []
+        counts = Counter(str(camera["source"]) for camera in self.cameras)
+        sources = counts.most_common()
+        texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
+        return [
+            f"cameras     focal lengths: {', '.join(texts)}",
+            *[f"            {note}" for note in camera_notes(self.cameras)],
+        ]
+
+    def _model_lines(self) -> list[str]:
+        if not self.models:
+            return []
+        lines = self.models[0].summary_lines()
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
-            lines += [f"models      {len(self.models)}, of {sizes} images"]
-        given = [
-            f"{key}={value}" for key, value in self.mapping["mapper_options"].items()
-        ]
+            lines.append(f"models      {len(self.models)}, of {sizes} images")
+        return lines
+
+    def _preset_lines(self) -> list[str]:
+        """Return the preset and the mapper, unless they are the usual ones."""
+        options = self.mapping["mapper_options"]
+        given = [f"{key}={value}" for key, value in options.items()]
         chosen = ", ".join([self.preset, f"{self.mapping['name']} mapper", *given])
-        lines += [f"preset      {chosen}"] if chosen != USUAL else []
-        if with_warnings:
-            lines += _some(
-                f"warning     {name}: {why}" for name, why in self.warnings.items()
-            )
-        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
-        lines += [f"seconds     {seconds}"]
-        for one in self.advice[:MAX_ADVICE]:
-            lines += [
-                "try         "
-                + "\n            ".join(filter(None, (one.why, one.command)))
-            ]
-        return "\n".join(lines)
+        return [] if chosen == USUAL else [f"preset      {chosen}"]

@@ -6,9 +6,8 @@ zeros, which change no distance. Matches have the attributes ``level``, whose fe
 together with those of level 0, and ``tried``, with a bit for each level that was tried. Beside
 them a pair may have learned matches that are not in use (:class:`Learned`), and pairs that use
 learned ones have the attribute ``measured_worth``: what the best of measured frames are worth.
-``guided.h5`` has a group per pair that was matched again by its geometry. Files are opened for one
-image or one batch of pairs and closed again; what is written in between appears as a whole
-(:mod:`colmap_affrect.project.atomic_files`).
+Files are opened for one image or one batch of pairs and closed again; what is written in between
+appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -29,9 +28,9 @@ from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.project.group_store import (
     GroupStore,
-    checked,
     entries_of,
     has_entry,
+    read_checked,
 )
 from colmap_affrect.project.line_report import (
     LINE_DATASETS,
@@ -77,7 +76,7 @@ def _entries_of(path: Path, _: str) -> Entries:
     found: Entries = {}
     with FeatureStore(path)._open("r") as file:
         for name, group in entries_of(file):
-            width, height = checked(group, "image_size").tolist()
+            width, height = read_checked(group, "image_size").tolist()
             found[name] = _content(group), len(group["keypoints"]), (width, height)
     return dict(sorted(found.items()))
 
@@ -89,12 +88,12 @@ def _content(group: h5py.Group) -> Content:
 
 
 def _level_ends(group: h5py.Group) -> dict[int, int]:
-    levels, ends = (checked(group, key).tolist() for key in ("levels", "level_ends"))
-    return dict(zip(levels, ends, strict=True))
+    levels = read_checked(group, "levels").tolist()
+    return dict(zip(levels, read_checked(group, "level_ends").tolist(), strict=True))
 
 
 def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
-    return {key: checked(group, key) for key in LINE_DATASETS if key in group}
+    return {key: read_checked(group, key) for key in LINE_DATASETS if key in group}
 
 
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
@@ -145,10 +144,16 @@ class FeatureStore(GroupStore):
             content: what the files hold that they are from.
             lines: its straight lines; None where they were not measured.
         """
-        more = {} if lines is None else line_datasets(lines)
         with self._open("a") as file:
-            ends = {0: len(features)}
-            self._write_features(file, name, features, image_size, ends, content, more)
+            self._write_features(
+                file,
+                name,
+                features,
+                image_size,
+                level_ends={0: len(features)},
+                content=content,
+                more={} if lines is None else line_datasets(lines),
+            )
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""
@@ -167,21 +172,31 @@ class FeatureStore(GroupStore):
                 del file[name]
 
     def extend(self, name: str, features: LocalFeatures, level: int) -> None:
-        """Add the features of another level; what is there keeps its indices."""
+        """Add the features of another level; what is there keeps its indices.
+
+        Args:
+            name: of the image.
+            features: of this level alone, in px of the stored image.
+            level: number of the level in the recipe.
+        """
         with self._open("a") as file:
             group = self._group(file, name)
-            size = tuple(checked(group, "image_size").tolist())
-            ends = _level_ends(group)
-            there = self._features(group)
-            first_id = int(there.rectification_ids.max(initial=0))
+            known = self._features(group)
+            first_id = int(known.rectification_ids.max(initial=0))
             ids = features.rectification_ids
             added = replace(
                 features, rectification_ids=np.where(ids, ids + first_id, 0)
             )
-            both = union(of_one_size([there, added]))
-            ends[level] = len(both)
-            more = _line_datasets(group)
-            self._write_features(file, name, both, size, ends, _content(group), more)
+            both = union(of_one_size([known, added]))
+            self._write_features(
+                file,
+                name,
+                features=both,
+                image_size=tuple(read_checked(group, "image_size").tolist()),
+                level_ends={**_level_ends(group), level: len(both)},
+                content=_content(group),
+                more=_line_datasets(group),
+            )
 
     def _write_features(
         self,
@@ -217,10 +232,22 @@ class FeatureStore(GroupStore):
             return lines_from_datasets(_line_datasets(self._group(file, name)))
 
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
-        """Return the indices of the features of two levels, each once, rising."""
+        """Return the indices of the features of two levels, each once, rising.
+
+        Args:
+            name: of the image.
+            level: number of a level in the recipe.
+            base: number of another one, or the same.
+
+        Returns:
+            (N,) int64.
+        """
         ranges = self.level_ranges(name)
-        parts = sorted((ranges[k] for k in {base, level}), key=lambda part: part.start)
-        return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+        indices = np.arange(ranges[level].start, ranges[level].stop)
+        if base == level:
+            return indices
+        others = np.arange(ranges[base].start, ranges[base].stop)
+        return np.sort(np.concatenate([others, indices]))
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if not has_entry(file, name):
@@ -230,19 +257,24 @@ class FeatureStore(GroupStore):
     @staticmethod
     def _features(group: h5py.Group) -> LocalFeatures:
         return LocalFeatures(
-            checked(group, "lafs").astype(np.float64),
-            checked(group, "scores"),
-            np.ascontiguousarray(checked(group, "descriptors").T, dtype=np.float32),
-            checked(group, "rectification_ids"),
+            lafs=read_checked(group, "lafs").astype(np.float64),
+            responses=read_checked(group, "scores"),
+            descriptors=np.ascontiguousarray(
+                read_checked(group, "descriptors").T, dtype=np.float32
+            ),
+            rectification_ids=read_checked(group, "rectification_ids"),
         )
 
     def level_ranges(self, name: str) -> dict[int, range]:
         """Return which features are of each level that an image has, in their order."""
         with self._open("r") as file:
             ends = _level_ends(self._group(file, name))
-        return dict(
-            zip(ends, map(range, [0, *ends.values()], ends.values()), strict=True)
-        )
+        ranges = dict[int, range]()
+        start = 0
+        for level, end in ends.items():
+            ranges[level] = range(start, end)
+            start = end
+        return ranges
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
@@ -263,7 +295,7 @@ class FeatureStore(GroupStore):
 
     def _values(self, name: str, dataset: str) -> NDArray[Any]:
         with self._open("r") as file:
-            return checked(self._group(file, name), dataset)
+            return read_checked(self._group(file, name), dataset)
 
 
 def pair_key(name1: str, name2: str) -> str:
@@ -299,7 +331,7 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             return _read_state(file)
 
-    def keep(self, **changes: Any) -> None:
+    def update_state(self, **changes: Any) -> None:
         """Change fields of the state."""
         with self._open("a") as file:
             _change_state(file, changes)
@@ -333,9 +365,8 @@ class MatchStore(GroupStore):
         known: dict[str, Any] = {"tried": 0}
         learned = None
         if has_entry(file, key):
-            known = {
-                name: file[key].attrs[name] for name in KEPT if name in file[key].attrs
-            }
+            attributes = file[key].attrs
+            known = {name: attributes[name] for name in KEPT if name in attributes}
             learned = _read_learned(file[key], pair.names)
         known["tried"] |= 1 << pair.level
         known |= {"level": pair.level, "of_some": pair.of_some}
@@ -346,11 +377,11 @@ class MatchStore(GroupStore):
     def _write_learned(self, file: h5py.File, learned: Learned) -> None:
         group = file[pair_key(*learned.matches.names)]
         for name, values in hloc_matches(learned.matches).items():
-            self._write_dataset(group, LEARNED + name, values)
+            self._write_dataset(group, name=LEARNED + name, values=values)
         group.attrs[LEARNED + "level"] = learned.matches.level
         group.attrs[LEARNED + "worth"] = learned.worth
 
-    def keep_learned(self, found: Iterable[Learned]) -> None:
+    def write_learned(self, found: Iterable[Learned]) -> None:
         """Write learned matches beside those in use."""
         with self._open("a") as file:
             for learned in found:
@@ -368,23 +399,22 @@ class MatchStore(GroupStore):
 
     def learned_levels(self, pairs: Iterable[Names]) -> dict[Names, int]:
         """Return the level of these by pair, without reading them; -1 where there are none."""
+        levels = dict[Names, int]()
         with self._open("r") as file:
-            groups = {names: file[pair_key(*names)] for names in pairs}
-            return {
-                n: int(group.attrs.get(LEARNED + "level", -1))
-                for n, group in groups.items()
-            }
+            for names in pairs:
+                attributes = file[pair_key(*names)].attrs
+                levels[names] = int(attributes.get(LEARNED + "level", -1))
+        return levels
 
     def measured_worths(self, pairs: Iterable[Names]) -> dict[Names, Worth]:
         """Return what the best measured matches of pairs are worth that use others."""
-        found = {}
+        worths = dict[Names, Worth]()
         with self._open("r") as file:
             for names in pairs:
-                inliers, consistent = file[pair_key(*names)].attrs.get(
-                    "measured_worth", (0, 0)
-                )
-                found[names] = int(inliers), int(consistent)
-        return found
+                attributes = file[pair_key(*names)].attrs
+                inliers, consistent = attributes.get("measured_worth", (0, 0))
+                worths[names] = (int(inliers), int(consistent))
+        return worths
 
     def choose(
         self,
@@ -410,20 +440,23 @@ class MatchStore(GroupStore):
         """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 
         Which pairs are escalated depends on all others.
+
+        Args:
+            images: names of images.
+            pairs: of image names.
         """
         if not self.path.exists():
             return
         gone = set(images)
-        names = {pair_key(name, "")[:-1] for name in gone}
-        keys = {pair_key(*pair) for pair in pairs}
+        image_keys = {pair_key(name, "")[:-1] for name in gone}
+        pair_keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
             _write_state(file, _read_state(file).without_pairs(gone))
             for key, group in list(entries_of(file)):
-                is_asked = key in keys or not names.isdisjoint(key.split("/"))
-                is_escalated = (
-                    group.attrs["tried"] > 1 or LEARNED + "level" in group.attrs
-                )
-                if is_asked or is_escalated:
+                is_of_image = not image_keys.isdisjoint(key.split("/"))
+                has_learned = LEARNED + "level" in group.attrs
+                is_escalated = has_learned or group.attrs["tried"] > 1
+                if key in pair_keys or is_of_image or is_escalated:
                     del file[key]
 
     def has(self, pairs: Sequence[Names]) -> Bools:
@@ -441,7 +474,9 @@ class MatchStore(GroupStore):
             for pair in pairs:
                 group = file[pair_key(*pair)]
                 if group.attrs["of_some"]:
-                    found[pair] = int(np.count_nonzero(checked(group, "matches0") >= 0))
+                    found[pair] = int(
+                        np.count_nonzero(read_checked(group, "matches0") >= 0)
+                    )
         return found
 
     def num_pairs(self) -> int:
@@ -452,7 +487,15 @@ class MatchStore(GroupStore):
     def levels(
         self, pairs: Iterable[Names], attribute: str = "level"
     ) -> dict[Names, int]:
-        """Return the level that the matches of each pair are from, or its ``tried`` ones."""
+        """Return the level that the matches of each pair are from, or its ``tried`` ones.
+
+        Args:
+            pairs: of image names.
+            attribute: ``level``, or ``tried``.
+
+        Returns:
+            By pair a level, or a number with a bit for each level that was tried.
+        """
         with self._open("r") as file:
             return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
 
@@ -482,12 +525,15 @@ def _write_state(file: h5py.File, state: MatchState) -> None:
 
 def _read_matches(group: h5py.Group, names: Names, prefix: str = "") -> PairMatches:
     """Read the matches of a pair, or those whose datasets begin with a prefix."""
-    matches0 = checked(group, f"{prefix}matches0").astype(np.int64)
+    matches0 = read_checked(group, f"{prefix}matches0").astype(np.int64)
     rows = np.flatnonzero(matches0 >= 0)
-    indices = np.stack([rows, matches0[rows]], axis=1)
-    scores = checked(group, f"{prefix}matching_scores0")[rows].astype(np.float32)
+    scores = read_checked(group, f"{prefix}matching_scores0")
     return PairMatches(
-        names, indices, scores, len(matches0), int(group.attrs[f"{prefix}level"])
+        names=names,
+        indices=np.stack([rows, matches0[rows]], axis=1),
+        scores=scores[rows].astype(np.float32),
+        num_keypoints1=len(matches0),
+        level=int(group.attrs[f"{prefix}level"]),
     )
 
 
@@ -495,45 +541,6 @@ def _read_learned(group: h5py.Group, names: Names) -> Learned | None:
     if LEARNED + "level" not in group.attrs:
         return None
     num_inliers, num_consistent = group.attrs[LEARNED + "worth"].tolist()
-    return Learned(_read_matches(group, names, LEARNED), (num_inliers, num_consistent))
-
-
-@dataclass(frozen=True)
-class GuidedPair:
-    """What guided matching found for a pair."""
-
-    names: Names  # of the two images, in the order of the columns
-    exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
-    num_inliers: int  # of the geometry that took the place of the one before; 0 where that stayed
-
-
-class GuidedStore(GroupStore):
-    """Which pairs were matched again by their geometry."""
-
-    format = "colmap_affrect/guided matches"
-    stage = "verify"
-
-    def write(self, pairs: Iterable[GuidedPair]) -> None:
-        """Write a batch of pairs, in the place of what is there of them."""
-        with self._open("a") as file:
-            for pair in pairs:
-                datasets = {"exact": pair.exact}
-                names = np.asarray(pair.names, dtype=h5py.string_dtype())
-                key = pair_key(*pair.names)
-                self._write(
-                    file, key, datasets, names=names, num_inliers=pair.num_inliers
-                )
-
-    def read(self) -> list[GuidedPair]:
-        """Read all pairs."""
-        if not self.path.exists():
-            return []
-        with self._open("r") as file:
-            found = []
-            for _, group in sorted(entries_of(file), key=lambda item: item[0]):
-                (first, second) = group.attrs["names"]
-                num = int(group.attrs["num_inliers"])
-                found.append(
-                    GuidedPair((str(first), str(second)), checked(group, "exact"), num)
-                )
-        return found
+    return Learned(
+        _read_matches(group, names, prefix=LEARNED), (num_inliers, num_consistent)
+    )

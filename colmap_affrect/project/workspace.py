@@ -22,12 +22,12 @@ from colmap_affrect.project.record import (
     PLANNED,
     STAGES,
     WEIGHTS,
-    Mapped,
-    MappedFrom,
+    MappingRecord,
+    ModelInputs,
     first_difference,
     read_record,
     record_text,
-    rewound,
+    rewind_record,
 )
 
 logger = logging.getLogger(__name__)
@@ -58,29 +58,24 @@ class Workspace:
         self.users_database = users_database
         self.database = users_database or path / "database.db"
         self.mapped_database = path / "mapped.db"  # a copy with what is done by hand
-        self.seal = path / "database.db.seal"  # what the last command left in it
+        # A digest of what the last command left in the database (see colmap_affrect.mend)
+        self.seal = path / "database.db.seal"
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
-        self.snapshots = (
-            path / "sparse.snapshots"
-        )  # from which an interrupted mapping goes on
+        # From which an interrupted mapping goes on
+        self.snapshots = path / "sparse.snapshots"
         self.best = path / "sparse.best"  # the best models so far, with their matches
         self.learned = path / "sparse.learned"  # models of learned matches alone
-        self.config, self.log = (
-            path / "config.toml",
-            path / "run.log",
-        )  # options; of all runs
-        self.report, self.page = (
-            path / "report.json",
-            path / "report.html",
-        )  # of the last run
-        self.cameras = (
-            path / "cameras.json"
-        )  # what is known of the database's, and from where
-        # The database, by another program, and is to be mapped so
+        self.config = path / "config.toml"  # the options on record
+        self.log = path / "run.log"  # of all runs
+        self.report = path / "report.json"  # of the last run
+        self.page = path / "report.html"  # of the last run
+        # What is known of the database's cameras, and from where
+        self.cameras = path / "cameras.json"
+        # Whether another program has changed the database, and it is to be mapped so
         self.is_changed = False
         self._record: dict[str, Any] | None = None
 
@@ -106,7 +101,7 @@ class Workspace:
                 if source.exists():
                     shutil.copy(source, path / source.name)
         made = Workspace(path)
-        made._write_record(rewound(self.recorded(), "verify"))
+        made._write_record(rewind_record(self.record(), "verify"))
         return made
 
     def refuse_run(self) -> None:
@@ -127,15 +122,14 @@ class Workspace:
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
         with suppress(OSError):  # not there, or refused when it is to be used
-            paths = list(self.path.iterdir())
-            for path in paths:
-                if (
-                    path.name.partition(".")[0] in OWN_STEMS
-                    or path.name == outputs.LOCK
-                ):
+            foreign = []
+            for path in self.path.iterdir():
+                stem = path.name.partition(".")[0]
+                if stem in OWN_STEMS or path.name == outputs.LOCK:
                     outputs.refuse_link(path)
                     outputs.refuse_what_waits(path)
-            foreign = [path.name for path in paths if not _may_be_ours(path)]
+                if not _may_be_ours(path):
+                    foreign.append(path.name)
             if foreign and not outputs.is_output_folder(self.path):
                 raise OptionError(
                     f"{self.path}: is not empty ({min(foreign)}) and was not made by "
@@ -202,7 +196,7 @@ class Workspace:
         except OSError:  # of a disk that is read-only: nobody works there
             return False
 
-    def recorded(self) -> Mapping[str, Any]:
+    def record(self) -> Mapping[str, Any]:
         """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
         if self._record is None:
             self._record = read_record(self.config)
@@ -213,80 +207,77 @@ class Workspace:
         self._record = None
 
     @property
-    def begun(self) -> list[str]:
+    def started_stages(self) -> list[str]:
         """The stages that have been run, in their order."""
-        return [stage for stage in STAGES if stage in self.recorded()]
+        return [stage for stage in STAGES if stage in self.record()]
 
     @property
     def is_foreign(self) -> bool:
         """Whether the database is a copy of another program's, or was changed by one."""
-        return self.is_changed or "copy" in self.begun
+        return self.is_changed or "copy" in self.started_stages
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
-        return str(self.recorded().get("recipe", ""))
+        return str(self.record().get("recipe", ""))
 
-    def planned(self, stage: str) -> dict[str, Any] | None:
+    def options_on_record(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
-        record = self.recorded()
+        record = self.record()
         options = record.get(stage, record.get(PLANNED, {}).get(stage))
-        return (
-            None
-            if options is None
-            else {k: v for k, v in options.items() if k != WEIGHTS}
-        )
+        if options is None:
+            return None
+        return {key: value for key, value in options.items() if key != WEIGHTS}
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
-        if stage not in self.begun:
+        if stage not in self.started_stages:
             first = f"run 'colmap-affrect {stage}' with this --output-path first"
             if self.users_database:
                 first = "call extract_features first, or move this folder along with its database"
             raise OptionError(
                 f"{self.path}: the {stage} stage has not been run there; {first}"
             )
-        return dict(self.recorded()[stage])
+        return dict(self.record()[stage])
 
     def photographs(self) -> Path | None:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
-            record = self.recorded()
-            path = {**record.get("copy", {}), **record.get("extract", {})}.get(
-                "image_path"
-            )
+            record = self.record()
+            options = {**record.get("copy", {}), **record.get("extract", {})}
+            path = options.get("image_path")
             return Path(path) if path else None
         return None
 
-    def made_from(self, what: str) -> str:
+    def input_digest(self, what: str) -> str:
         """Return the digest of the files that something was made from, empty if not known."""
-        return str(self.recorded().get(MADE_FROM, {}).get(what, ""))
+        return str(self.record().get(MADE_FROM, {}).get(what, ""))
 
-    def record_made_from(self, **digests: str) -> None:
+    def record_input_digests(self, **digests: str) -> None:
         """Put on record what things are made from now."""
-        record = self.recorded()
+        record = self.record()
         known = {**record.get(MADE_FROM, {}), **digests}
-        if any(self.made_from(what) != digest for what, digest in digests.items()):
+        if any(self.input_digest(what) != digest for what, digest in digests.items()):
             self._write_record({**record, MADE_FROM: known})
 
     @property
-    def mapped(self) -> Mapped | None:
+    def mapping_record(self) -> MappingRecord | None:
         """What is on record of the models that are there; None where they are to be made anew."""
-        values = self.recorded().get(MAPPED)
-        return Mapped(**values) if values else None
+        values = self.record().get(MAPPED)
+        return MappingRecord(**values) if values else None
 
-    def mapped_from(self) -> MappedFrom | None:
+    def model_inputs(self) -> ModelInputs | None:
         """Return what these models were made from, as far as it is known."""
-        return self.mapped.made_from if self.mapped else None
+        return self.mapping_record.inputs if self.mapping_record else None
 
-    def record_mapped(self, inputs: MappedFrom | None) -> None:
+    def record_mapping(self, inputs: ModelInputs | None) -> None:
         """Put on record what the models that are there were made from, and how many they are.
 
         Args:
             inputs: None where they are to be made anew.
         """
         values = {**inputs._asdict(), "number": self.num_models()} if inputs else None
-        if values != self.recorded().get(MAPPED):
-            self._write_record({**self.recorded(), MAPPED: values})
+        if values != self.record().get(MAPPED):
+            self._write_record({**self.record(), MAPPED: values})
 
     def num_models(self) -> int:
         """Return how many models there are, 0, 1, ..."""
@@ -296,7 +287,7 @@ class Workspace:
 
     def lacks_models(self) -> bool:
         """Return whether models that were made are gone, removed by somebody or half removed."""
-        number = self.mapped.number if self.mapped else 0
+        number = self.mapping_record.number if self.mapping_record else 0
         return not self.sparse.exists() or self.num_models() < number
 
     def record_options(
@@ -308,24 +299,28 @@ class Workspace:
         recipe: str = "",
         overwrite: bool = False,
     ) -> None:
-        """Put the options of a stage, nested mappings of plain values, on record before it begins.
+        """Put the options of a stage on record before it begins.
 
-        ``plan`` has options of later stages, those of stages that have begun stay as they are;
-        ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
-        and the later ones first; with the first stage their options are forgotten, too. Raises
-        ConflictError when other options made the results that are there.
+        Args:
+            stage: that begins.
+            options: its options, nested mappings of plain values.
+            plan: options of later stages; those of stages that have begun stay as they are.
+            recipe: its name, for the record only.
+            overwrite: first discard the results of this stage and the later ones; with the first
+                stage their options are forgotten, too.
+
+        Raises:
+            ConflictError: other options made the results that are there.
         """
         self._refuse_foreign_results(stage)
         outputs.remove_own(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        record = self.recorded()
+        record = self.record()
         if overwrite:
-            self.refuse_foreign_models()
-            outputs.remove_own(self._results(stage))
-            record = rewound(record, stage)
-            if not any(name in record for name in STAGES):
-                record = {}
+            record = self._record_without_results(stage)
         if stage in record:
-            why = first_difference(record[stage], options, OF_DATABASE.get(stage, ()))
+            why = first_difference(
+                record[stage], now=options, free=OF_DATABASE.get(stage, ())
+            )
             if why:
                 raise ConflictError(
                     f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
@@ -336,12 +331,18 @@ class Workspace:
             "recipe": recipe or record.get("recipe", ""),
         }
         planned = {**changed.pop(PLANNED, {}), **(plan or {})}
-        later = {
-            name: dict(values)
-            for name, values in planned.items()
-            if name not in changed
-        }
-        self._write_record({**changed, PLANNED: later} if later else changed)
+        for name, values in planned.items():
+            if name not in changed:
+                changed.setdefault(PLANNED, {})[name] = dict(values)
+        self._write_record(changed)
+
+    def _record_without_results(self, stage: str) -> Mapping[str, Any]:
+        """Remove the results of a stage and of those after it, and return the record without."""
+        self.refuse_foreign_models()
+        outputs.remove_own(self._results(stage))
+        record = rewind_record(self.record(), stage)
+        has_stages = not record.keys().isdisjoint(STAGES)
+        return record if has_stages else {}
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -351,11 +352,11 @@ class Workspace:
         """
         if self.users_database:
             raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
-        self.record_mapped(None)
-        outputs.remove_own(
-            path for path in self._results("verify") if path != self.sparse
-        )
-        self._write_record(rewound(self.recorded(), "verify"))
+        self.record_mapping(None)
+        results = self._results("verify")
+        results.remove(self.sparse)
+        outputs.remove_own(results)
+        self._write_record(rewind_record(self.record(), "verify"))
 
     @property
     def _remedy(self) -> str:
@@ -367,12 +368,14 @@ class Workspace:
 
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
-        if first in self.begun:
+        if first in self.started_stages:
             raise ConflictError(
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        for path in () if self.begun else self._results("extract"):
+        if self.started_stages:
+            return
+        for path in self._results("extract"):
             if path.exists() and path != self.users_database:
                 raise ConflictError(
                     f"{path}: exists and was not made here; it is left as it is, use "
@@ -381,15 +384,14 @@ class Workspace:
 
     def refuse_foreign_models(self) -> None:
         """Refuse to remove models beside which others have put something; ConflictError."""
-        files = list(self.sparse.glob("*"))
-        for folder in [
-            path for path in files if path.is_dir() and path.name.isdecimal()
-        ]:
-            files.remove(folder)
-            files += [
-                path for path in folder.iterdir() if path.name not in FILES_OF_MODEL
-            ]
-        if foreign := [path for path in files if not path.name.startswith(".")]:
+        foreign = list[Path]()
+        for path in self.sparse.glob("*"):
+            is_model = path.is_dir() and path.name.isdecimal()
+            for file in path.iterdir() if is_model else [path]:
+                is_own = is_model and file.name in FILES_OF_MODEL
+                if not is_own and not file.name.startswith("."):
+                    foreign.append(file)
+        if foreign:
             raise ConflictError(
                 f"{foreign[0]}: was not made by this run and would be removed with its models; "
                 "move it elsewhere, and run the same command again"

@@ -7,8 +7,8 @@ from itertools import zip_longest
 
 from colmap_affrect.colmap.verification import lone_ties
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport
-from colmap_affrect.project.stores import GuidedPair
 
 MAX_NUM_PAIRS = 12  # in a page; more nobody looks at
 MAX_NUM_ORDINARY = 3  # pairs of each sort that nothing speaks against

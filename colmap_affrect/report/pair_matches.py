@@ -51,7 +51,7 @@ class PairReader:
         """
         workspace = context.workspace
         model_path = workspace.sparse / "0"
-        has_stores = "match" in workspace.begun and not workspace.is_changed
+        has_stores = "match" in workspace.started_stages and not workspace.is_changed
         self.graph = graph
         self.run = context if has_stores else None
         self.model = (
@@ -67,7 +67,7 @@ class PairReader:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
         sizes = []
         keypoints = []
-        with self.graph.reading() as database:
+        with self.graph.open_to_read() as database:
             images = {image.name: image for image in database.read_all_images()}
             for name in names:
                 require_known(name, images)

@@ -13,15 +13,14 @@ from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.errors import such_as
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.camera_notes import camera_notes, merge_shared_cameras
 from colmap_affrect.project.reasons import FATES, Doubt, text_of, texts_of
 from colmap_affrect.project.report import (
     MAX_LINES,
     SOURCES,
     ModelSummary,
     ReconstructionReport,
-    as_mapped,
     by_story,
-    camera_notes,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -207,7 +206,7 @@ def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, An
     """Return the first cameras, each with its photographs, and the sources of all focal lengths."""
     numbers = {name: number for number, name in enumerate(names, 1)}
     rows = []
-    for camera in as_mapped(report.cameras)[:MAX_NUM_CAMERAS]:
+    for camera in merge_shared_cameras(report.cameras)[:MAX_NUM_CAMERAS]:
         known = [name for name in camera["names"] if name in numbers]
         photographs = such_as(f"{numbers[name]} {name}" for name in known)
         rows.append((camera, photographs))

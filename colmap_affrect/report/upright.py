@@ -48,7 +48,7 @@ def upright_of_run(model_path: Path, model: pycolmap.Reconstruction) -> Upright 
     if not workspace.features.exists():
         return None
     try:
-        if " " in workspace.made_from(
+        if " " in workspace.input_digest(
             "map"
         ):  # it extends another model, whose frame it keeps
             return None

@@ -30,10 +30,11 @@ from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.guided_store import GuidedStore
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
-from colmap_affrect.project.record import Content, MappedFrom, content_of, file_sha256
-from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
+from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
+from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 from colmap_affrect.session.view_graph import ViewGraph
@@ -59,11 +60,12 @@ class Inputs(Options):
     @classmethod
     def of(cls, image_path: Path, **given: Any) -> Self:
         """Build from paths, which are made absolute, and options; None is what is not given."""
-        values: dict[str, Any] = {
-            key: str(resolved(value)) if isinstance(value, Path) else value
-            for key, value in {"image_path": image_path, **given}.items()
-            if value is not None
-        }
+        values: dict[str, Any] = {"image_path": str(resolved(image_path))}
+        for key, value in given.items():
+            if isinstance(value, Path):
+                values[key] = str(resolved(value))
+            elif value is not None:
+                values[key] = value
         return cls(**values)
 
     @property
@@ -83,7 +85,7 @@ class Inputs(Options):
                 f"{self.from_database}: holds no images; import some first"
             )
         if not self.image_list_path:
-            return checked_names(folder, known, self.from_database)
+            return checked_names(folder, names=known, where=self.from_database)
         names = list_images(folder, listed)
         unknown = sorted(set(names) - set(known))
         if unknown:
@@ -98,9 +100,17 @@ class Inputs(Options):
         options: ExtractionOptions,
         known: Mapping[str, Content],
     ) -> dict[str, Content]:
-        """Return what the files of images hold, read where it may not be what is ``known``.
+        """Return what the files hold that the features of images depend on.
 
         Warps by depth depend on cameras, too; no other features do.
+
+        Args:
+            names: of the images.
+            options: of extraction.
+            known: what the files held; they are only read where that may be otherwise now.
+
+        Returns:
+            Digests and stamps by image.
         """
         found = {}
         cameras = ""
@@ -110,8 +120,9 @@ class Inputs(Options):
             files = self.photographs.files(name)
             if options.uses_depth:
                 depth = options.depth.file(name)
-                files += [*([depth] if depth else []), *self.camera_files]
-            found[name] = content_of(files, known.get(name), cameras)
+                files += [depth] if depth else []
+                files += self.camera_files
+            found[name] = content_of(files, known=known.get(name), options=cameras)
         return found
 
     def cameras_digest(self) -> str:
@@ -126,12 +137,11 @@ class Inputs(Options):
     @property
     def camera_files(self) -> list[Path]:
         """The files that cameras and images of the database are taken from."""
-        given = [
-            Path(path)
-            for path in (self.from_database, self.cameras.cameras_path)
-            if path
-        ]
-        return [file for path in given for file in source_files(path)]
+        files = list[Path]()
+        for path in (self.from_database, self.cameras.cameras_path):
+            if path:
+                files += source_files(Path(path))
+        return files
 
     def check(self) -> None:
         """Refuse cameras and masks that cannot be used; OptionError names the option."""
@@ -166,9 +176,8 @@ class Inputs(Options):
 def source_files(path: Path) -> list[Path]:
     """Return the files of a database, a table, or the folder of a model."""
     files = path.iterdir() if path.is_dir() else database_files(path)
-    return sorted(
-        file for file in files if file.is_file() and not file.name.endswith("-shm")
-    )
+    found = [file for file in files if not file.name.endswith("-shm")]
+    return sorted(filter(Path.is_file, found))
 
 
 class Resources(Options):
@@ -189,18 +198,21 @@ class Resources(Options):
 
     def usable_levels(self, options: ExtractionOptions) -> list[int]:
         """Return the first level, and those of escalation whose files of weights are here."""
-        there = {key for key in options.weights if find(key, self.weights_path)}
+        missing = set(self._missing_weights(options))
         return [
-            k
-            for k, level in enumerate(options.levels)
-            if not k or level.weights <= there
+            number
+            for number, level in enumerate(options.levels)
+            if number == 0 or missing.isdisjoint(level.weights)
         ]
 
     def how_to_complete(self, options: ExtractionOptions) -> str:
         """Return how to get what other levels wait for; empty if none does."""
-        keys = [key for key in options.weights if not find(key, self.weights_path)]
+        keys = self._missing_weights(options)
         hint = install_hint(WEIGHT_FILES[key] for key in keys)
         return f"{hint}colmap-affrect weights fetch {' '.join(keys)}" if keys else ""
+
+    def _missing_weights(self, options: ExtractionOptions) -> list[str]:
+        return [key for key in options.weights if not find(key, self.weights_path)]
 
 
 def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) -> None:
@@ -232,7 +244,7 @@ class OnRecord(Generic[Built]):
         workspace = context.workspace
         if self._stage == "extract":
             workspace.require("extract")
-        record = workspace.planned(self._stage) or {}
+        record = workspace.options_on_record(self._stage) or {}
         values = {
             key: value for key, value in record.items() if key not in self._others
         }
@@ -262,24 +274,24 @@ class Context:
     # For images and pairs, e.g. a cluster; None: threads here
     executor: Executor | None = None
     progress: Progress = SILENT  # where to show progress
-    deadline_s: float = (
-        math.inf
-    )  # of time.monotonic(): from then on nothing more is tried
-    effort: EffortName = "normal"  # how much is tried for images in need
+    # Of time.monotonic(): from then on nothing more is tried
+    deadline_s: float = math.inf
+    effort: EffortName = "normal"  # how much is tried for images to match again
     by_hand: ByHand = NOTHING  # tie points, wrong pairs, photographs to leave out
     command: tuple[str, ...] = ()  # words of the command line, for advice
-    graph: ViewGraph = field(
-        default_factory=lambda: ViewGraph(Path())
-    )  # of the database
+    # Of the database
+    graph: ViewGraph = field(default_factory=lambda: ViewGraph(Path()))
 
     def __post_init__(self) -> None:
         """Begin another graph where the folder, and so the database, is another."""
         if self.graph.path != self.workspace.database:
             object.__setattr__(self, "graph", ViewGraph(self.workspace.database))
 
-    def to_map(self, extends: str = "") -> MappedFrom:
+    def current_model_inputs(self, extends: str = "") -> ModelInputs:
         """Return what models are made from now, perhaps with the digest of one that they extend."""
-        return MappedFrom(self.graph.digest(), self.by_hand.digest(), extends)
+        return ModelInputs(
+            verified=self.graph.digest(), by_hand=self.by_hand.digest(), extends=extends
+        )
 
     def listed_pairs(self) -> PairList:
         """Return the pairs of the list whose images have features."""
@@ -296,18 +308,14 @@ class Context:
     def usable(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Return the pairs whose images the database has, but those rejected by hand."""
         ids = self.graph.ids
-        found = list[Pair]()
-        for first, second in pairs:
-            if first in ids and second in ids and self.by_hand.allows(first, second):
-                found.append((first, second))
-        return found
+        known = [pair for pair in pairs if pair[0] in ids and pair[1] in ids]
+        return [pair for pair in known if self.by_hand.allows(*pair)]
 
     def num_verified_inliers(self) -> dict[Pair, int]:
         """Return the number of inliers of each verified pair; another program has its threshold."""
-        is_foreign = self.workspace.is_foreign
-        return self.graph.num_inliers(
-            1 if is_foreign else self.verification.min_num_inliers
-        )
+        if self.workspace.is_foreign:
+            return self.graph.num_inliers(1)
+        return self.graph.num_inliers(self.verification.min_num_inliers)
 
     def verified_inliers(self) -> dict[Pair, Indices]:
         """Return the (M, 2) features of each verified pair that are inliers."""

@@ -25,52 +25,74 @@ def start_database(workspace: Workspace, inputs: Inputs) -> None:
 def add_images(
     workspace: Workspace, graph: ViewGraph, inputs: Inputs, names: Sequence[str]
 ) -> dict[str, str]:
-    """Add images that the database lacks; return those that COLMAP does not take, with reasons."""
+    """Add the images that the database lacks.
+
+    Args:
+        workspace: whose database it is.
+        graph: of the database; it is read anew afterwards.
+        inputs: the photographs, and what is known of their cameras.
+        names: of the images that the database is to have.
+
+    Returns:
+        Why COLMAP does not take images, by their names.
+    """
     start_database(workspace, inputs)
-    original = Path(inputs.from_database) if inputs.from_database else None
     rejected = import_images(
-        workspace.database, Path(inputs.image_path), names, inputs.cameras
+        workspace.database,
+        image_path=Path(inputs.image_path),
+        names=names,
+        options=inputs.cameras,
     )
     graph.forget()
+    initial_cameras = None if inputs.from_database else inputs.initial_cameras
+    known = None
+    if inputs.from_database:
+        original = Path(inputs.from_database)
+        known = read_camera_records(original.with_name(workspace.cameras.name))
     record_cameras(
         graph.cameras,
-        workspace.cameras,
-        None if original else inputs.initial_cameras,
-        read_camera_records(original.with_name(workspace.cameras.name))
-        if original
-        else None,
+        records_path=workspace.cameras,
+        initial=initial_cameras,
+        known=known,
     )
-    reason = f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})"
-    return dict.fromkeys(rejected, reason)
+    return dict.fromkeys(
+        rejected,
+        f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})",
+    )
 
 
 def write_images_and_keypoints(context: Context) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     store = context.features
     graph = context.graph
+    workspace = context.workspace
     counts = store.num_keypoints()
-    has_database = context.workspace.database.exists()
-    if (
-        has_database
-        and context.workspace.cameras.exists()
-        and counts == graph.num_keypoints
-    ):
+    has_files = workspace.database.exists() and workspace.cameras.exists()
+    if has_files and counts == graph.num_keypoints:
         return {}
-    rejected = add_images(context.workspace, graph, context.inputs, list(counts))
-    known = graph.num_keypoints
-    lacking = [
-        name for name in counts if name in graph.ids and counts[name] != known.get(name)
-    ]
-    if not lacking:
-        return rejected
+    rejected = add_images(workspace, graph, context.inputs, names=list(counts))
     ids = graph.ids
-    with graph.opened() as database:
-        for name in lacking:
-            ends = [part.stop for part in store.level_ranges(name).values()]
-            colmap_database.write_keypoints(
-                database, ids[name], store.read_frames(name), ends
-            )
+    known = graph.num_keypoints
+    in_database = ids.keys() & counts.keys()
+    lacking = [name for name in in_database if counts[name] != known.get(name)]
+    if lacking:
+        _write_keypoints(context, sorted(lacking))
     return rejected
+
+
+def _write_keypoints(context: Context, names: Sequence[str]) -> None:
+    """Write the keypoints of images, in the place of those that are there."""
+    store = context.features
+    ids = context.graph.ids
+    with context.graph.open_to_change() as database:
+        for name in names:
+            ranges = store.level_ranges(name).values()
+            colmap_database.write_keypoints(
+                database,
+                image_id=ids[name],
+                lafs=store.read_frames(name),
+                level_ends=[part.stop for part in ranges],
+            )
 
 
 def write_matches(
@@ -96,6 +118,8 @@ def write_matches(
     if not replaces:
         wanted = colmap_database.lack_matches(database, ids_of_pairs)
     todo = listed.at(wanted)
-    for found in context.matches.read(todo) if todo else ():
-        first, second = (ids[name] for name in found.names)
-        colmap_database.write_matches(database, first, second, found.indices)
+    if not todo:
+        return
+    for found in context.matches.read(todo):
+        first, second = found.names
+        colmap_database.write_matches(database, ids[first], ids[second], found.indices)

@@ -39,8 +39,13 @@ class InputOptions(Options):
 
     def inputs(self, image_path: Path) -> Inputs:
         """Return the photographs of a folder, with their cameras and masks."""
-        names = ("image_list_path", "from_database", "cameras", "masks")
-        return Inputs.of(image_path, **{name: getattr(self, name) for name in names})
+        return Inputs.of(
+            image_path,
+            image_list_path=self.image_list_path,
+            from_database=self.from_database,
+            cameras=self.cameras,
+            masks=self.masks,
+        )
 
 
 class RunOptions(InputOptions):

@@ -1,9 +1,9 @@
 """The view graph of a command: images, cameras and verified pairs, read from the database once.
 
 All stages of a command share one (``Context.graph``). What changes the database goes through
-:meth:`ViewGraph.opened`, or is followed by :meth:`ViewGraph.forget`; then the graph is read anew
-when it is next asked for. While a command works, its lock keeps other runs out of the folder, and
-the database stays open from one stage to the next (:meth:`ViewGraph.kept_open`).
+:meth:`ViewGraph.open_to_change`, or is followed by :meth:`ViewGraph.forget`. Then the graph is read
+anew when it is next asked for. While a command works, its lock keeps other runs out of the folder,
+and the database stays open from one stage to the next (:meth:`ViewGraph.keep_open`).
 """
 
 from collections.abc import Iterator
@@ -26,9 +26,8 @@ class ImageRows:
 
     ids: dict[str, int]
     cameras: dict[str, pycolmap.Camera]
-    num_keypoints: dict[
-        str, int
-    ]  # of the images that have keypoints on record, also none
+    # Of the images that have keypoints on record, also none
+    num_keypoints: dict[str, int]
 
 
 class ViewGraph:
@@ -49,7 +48,7 @@ class ViewGraph:
         self._kept: pycolmap.Database | None = None
 
     @contextmanager
-    def kept_open(self) -> Iterator[None]:
+    def keep_open(self) -> Iterator[None]:
         """Open the database at most once while the block works, unless it is forgotten there."""
         self._is_kept_open = True
         try:
@@ -64,7 +63,7 @@ class ViewGraph:
         self._open.close()
 
     @contextmanager
-    def reading(self) -> Iterator[pycolmap.Database]:
+    def open_to_read(self) -> Iterator[pycolmap.Database]:
         """Open the database, or take it where it is open, to change nothing."""
         if not self._is_kept_open:
             with open_database(self.path) as database:
@@ -82,7 +81,7 @@ class ViewGraph:
             raise
 
     @contextmanager
-    def opened(self, *, for_pairs: bool = False) -> Iterator[pycolmap.Database]:
+    def open_to_change(self, *, for_pairs: bool = False) -> Iterator[pycolmap.Database]:
         """Open the database, perhaps to change it.
 
         Args:
@@ -90,7 +89,7 @@ class ViewGraph:
         """
         images = self._images if for_pairs else None
         try:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 yield database
         finally:
             self._forget_rows()
@@ -130,17 +129,13 @@ class ViewGraph:
         Returns:
             By pair of image names (M, 2) features of both images.
         """
-        found = self._all_inliers()
-        return {
-            pair: rows for pair, rows in found.items() if len(rows) >= min_num_inliers
-        }
+        inliers = self._all_inliers().items()
+        return {pair: rows for pair, rows in inliers if len(rows) >= min_num_inliers}
 
     def num_inliers(self, min_num_inliers: int) -> dict[Pair, int]:
         """Return the number of inliers of each pair that has at least so many."""
-        return {
-            pair: len(matches)
-            for pair, matches in self.inliers(min_num_inliers).items()
-        }
+        inliers = self.inliers(min_num_inliers)
+        return {pair: len(matches) for pair, matches in inliers.items()}
 
     def digest(self) -> str:
         """Return a SHA-256 of all rows but descriptors."""
@@ -157,31 +152,29 @@ class ViewGraph:
     def _image_rows(self) -> ImageRows:
         self._forget_if_gone()
         if self._images is None:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 self._images = _read_images(database)
         return self._images
 
     def _all_inliers(self) -> dict[Pair, Indices]:
         self._forget_if_gone()
         if self._inliers is None:
-            with self.reading() as database:
+            with self.open_to_read() as database:
                 self._images = self._images or _read_images(database)
                 self._inliers = _read_inliers(database, self._images)
         return self._inliers
 
 
 def _read_images(database: pycolmap.Database) -> ImageRows:
-    images = database.read_all_images()
     cameras = cameras_of_images(database)
-    return ImageRows(
-        ids={image.name: image.image_id for image in images},
-        cameras={image.name: cameras[image.image_id] for image in images},
-        num_keypoints={
-            image.name: database.num_keypoints_for_image(image.image_id)
-            for image in images
-            if database.exists_keypoints(image.image_id)
-        },
-    )
+    rows = ImageRows(ids={}, cameras={}, num_keypoints={})
+    for image in database.read_all_images():
+        rows.ids[image.name] = image.image_id
+        rows.cameras[image.name] = cameras[image.image_id]
+        if database.exists_keypoints(image.image_id):
+            count = database.num_keypoints_for_image(image.image_id)
+            rows.num_keypoints[image.name] = count
+    return rows
 
 
 def _read_inliers(

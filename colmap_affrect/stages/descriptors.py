@@ -64,7 +64,7 @@ def match_descriptors(
         "image 2": (keypoints2, descriptors2),
     }
     pair = ("image 1", "image 2")
-    return match_feature_sets(sets, [pair], options)[pair]
+    return match_feature_sets(sets, pairs=[pair], options=options)[pair]
 
 
 @checks_arguments
@@ -89,21 +89,23 @@ def match_feature_sets(
     Raises:
         OptionError: for arrays that do not fit, or pairs of other images.
     """
-    listed = (
-        exhaustive_pairs(list(features)) if pairs is None else list(map(_two, pairs))
-    )
-    for name in {name for pair in listed for name in pair}:
-        if name not in features:
-            raise OptionError(f"{name}: is in a pair, and has no features")
+    if pairs is None:
+        listed = exhaustive_pairs(list(features))
+    else:
+        listed = list(map(_two, pairs))
+    unknown = set().union(*listed).difference(features)
+    if unknown:
+        raise OptionError(f"{min(unknown)}: is in a pair, and has no features")
+    found = dict[Pair, Matches]()
     with progress.stage("match", len(listed), "pairs") as advance:
-        found = dict[Pair, Matches]()
-        for pair, matches in matched(listed, lambda name: features[name], options):
+        matched = iterate_matches(listed, lambda name: features[name], options)
+        for pair, matches in matched:
             found[pair] = matches
             advance(1)
     return found
 
 
-def matched(
+def iterate_matches(
     pairs: Sequence[Pair],
     read: Callable[[str], Arrays],
     options: NearestOptions | None = None,
@@ -115,8 +117,10 @@ def matched(
         read: returns (N, 2) keypoints and (N, D) descriptors of an image.
         options: of the matcher.
     """
-    context = MatcherContext(num_comparisons=len(pairs) * USUAL_FEATURES**2)
-    matcher = NearestNeighbors(options or NearestOptions(), context)
+    matcher = NearestNeighbors(
+        options or NearestOptions(),
+        MatcherContext(num_comparisons=len(pairs) * USUAL_FEATURES**2),
+    )
     sizes = dict[int, str]()
 
     @lru_cache(maxsize=IMAGES_IN_MEMORY)
@@ -132,8 +136,11 @@ def matched(
         return matcher.prepare(image)
 
     ordered = list(ordered_for_reuse(pairs, IMAGES_IN_MEMORY // 2))
-    tasks = ((prepared(first), prepared(second)) for first, second in ordered)
-    found = map_ordered(lambda both: matcher.match(*both), tasks, available_cores())
+    found = map_ordered(
+        lambda both: matcher.match(*both),
+        tasks=((prepared(first), prepared(second)) for first, second in ordered),
+        num_threads=available_cores(),
+    )
     yield from zip(ordered, found, strict=True)
 
 
@@ -148,34 +155,12 @@ def _as_features(name: str, given: Arrays) -> ImageFeatures:
     """Check the arrays of an image, and return them as a matcher takes them."""
     try:
         points, rows = map(_as_array, given)
-    except (
-        TypeError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # of numpy and torch, or not two
+    except (TypeError, ValueError, RuntimeError) as error:  # numpy's, torch's, or not 2
         why = " ".join(str(error).split())
         raise OptionError(
             f"{name}: give keypoints and descriptors as two arrays ({why})"
         ) from error
-    if (
-        points.ndim != 2
-        or points.shape[1] < 2
-        or rows.ndim != 2
-        or len(rows) != len(points)
-    ):
-        raise OptionError(
-            f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
-            "(N, 2) places and (N, D) descriptors"
-        )
-    if points.dtype.kind not in "fiu":
-        raise OptionError(f"{name}: keypoints are {points.dtype}; give numbers of px")
-    if rows.dtype.kind not in "fiu" or (
-        rows.dtype.kind in "iu" and rows.shape[1] != SIFT_SIZE
-    ):
-        raise OptionError(
-            f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
-            "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
-        )
+    _check_arrays(name, points, rows)
     unit = unit_rows(rows)
     if not np.isfinite(unit).all():
         raise OptionError(f"{name}: descriptors are not finite")
@@ -184,9 +169,31 @@ def _as_features(name: str, given: Arrays) -> ImageFeatures:
         check = CHECKS[kind]
         raise OptionError(f"{check['what']}: {name}; {check['advice']}")
     count = len(places)
-    lafs = lafs_from_keypoints(places, np.ones(count), np.zeros(count))
-    features = LocalFeatures(lafs, np.ones(count, np.float32), unit)
-    return ImageFeatures(features, (0, 0), "")
+    lafs = lafs_from_keypoints(
+        places, radii_px=np.ones(count), angles_rad=np.zeros(count)
+    )
+    features = LocalFeatures(
+        lafs=lafs, responses=np.ones(count, np.float32), descriptors=unit
+    )
+    return ImageFeatures(features=features, image_size=(0, 0), extractor="")
+
+
+def _check_arrays(name: str, points: NDArray[Any], rows: NDArray[Any]) -> None:
+    """Refuse arrays that cannot be keypoints and descriptors of an image; OptionError."""
+    are_points = points.ndim == 2 and points.shape[1] >= 2
+    if not are_points or rows.ndim != 2 or len(rows) != len(points):
+        raise OptionError(
+            f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
+            "(N, 2) places and (N, D) descriptors"
+        )
+    if points.dtype.kind not in "fiu":
+        raise OptionError(f"{name}: keypoints are {points.dtype}; give numbers of px")
+    is_sift = rows.dtype.kind in "iu" and rows.shape[1] == SIFT_SIZE
+    if rows.dtype.kind != "f" and not is_sift:
+        raise OptionError(
+            f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
+            "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
+        )
 
 
 def _as_array(given: Any) -> NDArray[Any]:
@@ -201,9 +208,8 @@ def unit_rows(descriptors: Floats) -> Singles:
     exact = descriptors.astype(np.float64)
     with np.errstate(all="ignore"):  # what is not finite stays so
         _, exponents = np.frexp(np.abs(exact).max(axis=1, keepdims=True, initial=0.0))
-        rows = np.ldexp(exact, -exponents).astype(
-            np.float32
-        )  # whose squares are no 0 or infinity
+        # Squares of these are neither 0 nor infinity.
+        rows = np.ldexp(exact, -exponents).astype(np.float32)
         lengths = np.linalg.norm(rows, axis=1, keepdims=True)
         return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
 
@@ -245,14 +251,16 @@ def match_database(
     known = set(names)
     with colmap_database.open_database(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        todo = _unmatched(database, [p for p in listed if known.issuperset(p)], ids)
+        todo = _unmatched(
+            database, pairs=[p for p in listed if known.issuperset(p)], ids=ids
+        )
 
         def read(name: str) -> Arrays:
-            return _read_arrays(database, ids[name], f"{path}: {name}")
+            return _read_arrays(database, image_id=ids[name], where=f"{path}: {name}")
 
         with progress.stage("match", len(todo), "pairs") as advance:
             try:
-                for (first, second), found in matched(todo, read, options):
+                for (first, second), found in iterate_matches(todo, read, options):
                     colmap_database.write_matches(
                         database, ids[first], ids[second], found.indices
                     )
@@ -266,17 +274,18 @@ def _unmatched(
     database: pycolmap.Database, pairs: Sequence[Pair], ids: Mapping[str, int]
 ) -> list[Pair]:
     """Return the pairs of which no matches are on record, not even none."""
-    numbers = np.array(
-        [[ids[name] for name in pair] for pair in pairs], np.int64
-    ).reshape(-1, 2)
+    ids_of_pairs = [(ids[first], ids[second]) for first, second in pairs]
+    numbers = np.array(ids_of_pairs, np.int64).reshape(-1, 2)
     lacking = colmap_database.lack_matches(database, numbers)
-    return [pair for pair, lacks in zip(pairs, lacking, strict=True) if lacks]
+    return [pairs[row] for row in np.flatnonzero(lacking).tolist()]
 
 
 def _read_arrays(database: pycolmap.Database, image_id: int, where: str) -> Arrays:
     """Return the keypoints, in pixel-centre px, and the descriptors of an image."""
     points = np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
-    values = colmap_database.read_descriptors(database, image_id, len(points), where)
+    values = colmap_database.read_descriptors(
+        database, image_id, num_keypoints=len(points), where=where
+    )
     return np.asarray(pixel_from_colmap(points)), values
 
 
@@ -297,27 +306,25 @@ def write_given_matches(
     Raises:
         StoreError: when a match points at no keypoint.
     """
-    images = {image.name: image for image in database.read_all_images()}
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    counts = {
-        n: database.num_keypoints_for_image(i.image_id) for n, i in images.items()
-    }
-    for pair, indices in given.read(counts):
-        first, second = (images[name] for name in pair)
+    ids = dict[str, int]()
+    counts = dict[str, int]()
+    are_calibrated = dict[str, bool]()
+    for image in database.read_all_images():
+        ids[image.name] = image.image_id
+        counts[image.name] = database.num_keypoints_for_image(image.image_id)
+        is_calibrated = cameras[image.camera_id].has_prior_focal_length
+        are_calibrated[image.name] = is_calibrated
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    for (first, second), indices in given.read(counts):
         try:
-            colmap_database.write_matches(
-                database, first.image_id, second.image_id, indices
-            )
+            colmap_database.write_matches(database, ids[first], ids[second], indices)
         except DatabaseError as error:
-            raise StoreError(f"{given.path}: {pair[0]}, {pair[1]}: {error}") from error
+            raise StoreError(f"{given.path}: {first}, {second}: {error}") from error
         if match_type == "inliers":
-            known = [
-                cameras[image.camera_id].has_prior_focal_length
-                for image in (first, second)
-            ]
+            is_calibrated = are_calibrated[first] and are_calibrated[second]
             geometry = pycolmap.TwoViewGeometry()
-            kinds = pycolmap.TwoViewGeometryConfiguration
-            geometry.config = kinds.CALIBRATED if all(known) else kinds.UNCALIBRATED
+            geometry.config = kinds.CALIBRATED if is_calibrated else kinds.UNCALIBRATED
             geometry.inlier_matches = indices.astype(np.uint32)
-            database.write_two_view_geometry(first.image_id, second.image_id, geometry)
+            database.write_two_view_geometry(ids[first], ids[second], geometry)
         advance(1)

@@ -2,10 +2,9 @@
 
 import logging
 import time
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
@@ -24,7 +23,7 @@ from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.stores import NOT_KNOWN, FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context, Inputs
@@ -50,76 +49,131 @@ def extract(
     """Extract features of all images and put cameras, images and keypoints into the database.
 
     An image that cannot be read is reported and passed over. One that cannot be rectified, for
-    want of a depth map, is extracted as it is, with a warning. The options of later stages are
-    put on record too: ``later``, by name, beside those of the recipe. ``image_names`` are looked at
-    in the place of a list on record.
+    want of a depth map, is extracted as it is, with a warning.
+
+    Args:
+        context: of the workspace.
+        inputs: the photographs, and what is known of their cameras.
+        recipe: says which features.
+        image_names: photographs to extract in the place of all that the inputs name.
+        later: options of later stages, by their names; they are put on record beside those of the
+            recipe.
+        overwrite: discard what there is.
+
+    Returns:
+        How many images were extracted now and before, and why others were not.
+
+    Raises:
+        ImageError: none of the images can be used.
     """
     start = time.perf_counter()
     workspace = context.workspace
     folder = Path(inputs.image_path)
     inputs.check()
     workspace.require_own(folder)
-    if inputs.from_database and not workspace.database.exists():
-        refuse_unusable(
-            Path(inputs.from_database), FATAL_FOR_IMAGES
-        )  # before it is on record
-    if image_names:
-        names = checked_names(folder, image_names, "image_names")
-    else:
-        names = inputs.names()
-    options = recipe.extraction
+    _check_source(workspace, inputs)
+    names = _names(inputs, image_names)
     known = {} if overwrite else context.features.contents()
-    contents = inputs.contents(names, options, known)
-    # Those that were there before were seen to be good.
-    notes = inputs.check_names(names) if contents != known else {}
-    whole = inputs.photographs.without_mask(names)
-    extractor = one_image.prepare(options, context.resources, names, context.progress)
+    contents = inputs.contents(names, recipe.extraction, known)
+    warnings = dict[str, str]()
+    if contents != known:  # those that were there before were seen to be good
+        warnings |= inputs.check_names(names)
+    mask_warnings = _mask_warnings(inputs, names)
+    extractor = one_image.prepare(
+        recipe.extraction, context.resources, names, context.progress
+    )
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
-    weights = digests(extractor.weights)
-    given = {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights}
-    _record(workspace, given, recipe, later or {}, overwrite)
-    warnings = notes | _forget_changed(
-        context, inputs, contents, are_all=not image_names
-    )
+    _record(context, inputs, recipe, extractor, later=later or {}, overwrite=overwrite)
+    warnings |= _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
     if not (inputs.image_list_path or image_names):
-        warnings |= (
-            not_named(folder, names) if inputs.from_database else left_out(folder)
-        )
-    if whole:
-        warnings["masks"] = (
-            f"{len(whole)} images have none and are used whole, as {whole[0]} is"
-        )
+        warnings |= _warnings_of_the_folder(inputs, names)
+    warnings |= mask_warnings
     _log_warnings(warnings)
-    failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
-    if len(failures) == len(names):
-        why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
-        raise ImageError(f"{folder}: {why}")
+    failures = _extract_missing(
+        context, inputs, extractor, names=missing, contents=contents, warnings=warnings
+    )
+    _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
-    new = set(missing) - failures.keys()
-    kept = done - failures.keys()
-    wall_s = time.perf_counter() - start
-    return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
+    return StageReport(
+        name="extract",
+        wall_s=time.perf_counter() - start,
+        num_done=len(set(missing) - failures.keys()),
+        num_kept=len(done - failures.keys()),
+        failures=failures,
+        warnings=warnings,
+    )
+
+
+def _names(inputs: Inputs, image_names: Sequence[PathLike]) -> list[str]:
+    """Return the photographs to extract: those that are named, else those of the inputs."""
+    if not image_names:
+        return inputs.names()
+    folder = Path(inputs.image_path)
+    return checked_names(folder, names=image_names, where="image_names")
+
+
+def _check_source(workspace: Workspace, inputs: Inputs) -> None:
+    """Refuse a database to begin with that cannot be used, before it is on record."""
+    if inputs.from_database and not workspace.database.exists():
+        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
+
+
+def _require_one_usable(
+    folder: Path, names: Sequence[str], failures: Mapping[str, str]
+) -> None:
+    if len(failures) == len(names):
+        first = failures[names[0]]
+        raise ImageError(
+            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
+        )
 
 
 def _record(
-    workspace: Workspace,
-    given: Mapping[str, Any],
+    context: Context,
+    inputs: Inputs,
     recipe: Recipe,
+    extractor: ImageExtractor,
+    *,
     later: Mapping[str, Options],
     overwrite: bool,
 ) -> None:
     """Put what was given on record, and the options that later stages take where none are given."""
-    plan = dict[str, Any]()
-    for stage, options in {**recipe.later_stages, **later}.items():
-        plan[stage] = options.to_mapping()
-    workspace.record_options(
-        "extract", given, plan=plan, recipe=recipe.name, overwrite=overwrite
+    options = {
+        **inputs.to_mapping(),
+        **recipe.extraction.to_mapping(),
+        WEIGHTS: digests(extractor.weights),
+    }
+    planned = {**recipe.later_stages, **later}
+    context.workspace.record_options(
+        "extract",
+        options,
+        plan={stage: given.to_mapping() for stage, given in planned.items()},
+        recipe=recipe.name,
+        overwrite=overwrite,
     )
+
+
+def _mask_warnings(inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
+    """Return a warning of the images that have no mask where masks are given."""
+    whole = inputs.photographs.without_mask(names)
+    if not whole:
+        return {}
+    return {
+        "masks": f"{len(whole)} images have none and are used whole, as {whole[0]} is"
+    }
+
+
+def _warnings_of_the_folder(inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
+    """Return warnings of the photographs of the folder that are not used."""
+    folder = Path(inputs.image_path)
+    if inputs.from_database:
+        return not_named(folder, names)
+    return left_out(folder)
 
 
 def _log_warnings(warnings: Mapping[str, str]) -> None:
@@ -141,7 +195,7 @@ def _extract_missing(
     images = [(name, 0) for name in names]
     failures = dict[str, str]()
     faded = list[str]()
-    white = list[str]()
+    white = list[str]()  # images whose mask leaves out nothing
     with (
         context.progress.stage("extract", len(names), "images") as advance,
         closing(extract_images(context, inputs, extractor, images)) as found_images,
@@ -159,21 +213,27 @@ def _extract_missing(
                     faded.append(name)
                 if found.mask_is_white:
                     white.append(name)
-                size = found.image_size
-                store.write(name, found.features, size, contents[name], found.lines)
+                store.write(
+                    name,
+                    features=found.features,
+                    image_size=found.image_size,
+                    content=contents[name],
+                    lines=found.lines,
+                )
             advance(1)
+    more = dict[str, str]()
     if faded:
-        warnings["contrast"] = (
+        more["contrast"] = (
             f"is low in {len(faded)} of {len(names)} photographs, such as {one_line(faded[0])}; it "
             "was stretched (--set stretch_contrast=false leaves it as it is)"
         )
-        logger.warning("contrast: %s", warnings["contrast"])
     if white:
-        warnings["white masks"] = (
+        more["white masks"] = (
             f"{len(white)} masks are white all over, such as that of {one_line(white[0])}, and "
             "leave out nothing; black is where features are not wanted"
         )
-        logger.warning("white masks: %s", warnings["white masks"])
+    _log_warnings(more)
+    warnings.update(more)
     return failures
 
 
@@ -185,42 +245,70 @@ def extract_images(
 ) -> Generator[ExtractedImage | ImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 
-    ``images`` are names and levels of escalation. By default there are as many threads as cores and
-    memory allow. AffrectError when workers do not see the photographs or the depth maps.
+    By default there are as many threads as cores and memory allow.
+
+    Args:
+        context: of the workspace.
+        inputs: the photographs, and what is known of their cameras.
+        extractor: of the recipe.
+        images: names and levels of escalation.
+
+    Raises:
+        AffrectError: workers do not see the photographs or the depth maps.
     """
     if not images:
         return
-    if later := {name for name, level in images if level}:
-        _refuse_changed(context, inputs, later)
-    levels = [extractor.options.levels[k] for k in {k for _, k in images}]
-    num = one_image.num_images_at_once(levels)
-    executor = context.executor or Threads(min(num, len(images)))
+    options = extractor.options
+    escalated = {name for name, level in images if level}
+    if escalated:
+        _refuse_changed(context, inputs, names=escalated)
+    executor = context.executor or _threads(extractor, images)
     files = inputs.photographs.files(images[0][0])
-    if extractor.options.depth.path:
-        files.append(Path(extractor.options.depth.path))
-    path = context.workspace.database
-    initial = inputs.initial_cameras
-    known = context.graph.cameras if path.exists() else {}
-    names = inputs.names() if extractor.options.uses_depth else []
-
-    def task(name: str, level: int) -> ImageTask:
-        camera = known.get(name)
-        intrinsics = None
-        if extractor.options.uses_depth:
-            matrix = colmap_database.camera_matrix
-            intrinsics = matrix(camera) if camera else initial.matrix(name, names)
-        size = (camera.width, camera.height) if camera else None
-        return ImageTask(inputs.photographs, name, level, intrinsics, size)
-
-    tasks = (task(*image) for image in images)
-    for (name, level), found in zip(
-        images, executor.map(extractor, tasks, files), strict=True
-    ):
+    if options.depth.path:
+        files.append(Path(options.depth.path))
+    tasks = _tasks(context, inputs, extractor, images)
+    extracted = executor.map(extractor, tasks, files)
+    for (name, level), found in zip(images, extracted, strict=True):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
             if found.warning:
                 logger.warning("%s: %s", name, found.warning)
         yield found
+
+
+def _threads(extractor: ImageExtractor, images: Sequence[tuple[str, int]]) -> Threads:
+    """Return as many threads as cores and memory allow."""
+    numbers = {level for _, level in images}
+    levels = [extractor.options.levels[number] for number in numbers]
+    return Threads(min(one_image.num_images_at_once(levels), len(images)))
+
+
+def _tasks(
+    context: Context,
+    inputs: Inputs,
+    extractor: ImageExtractor,
+    images: Iterable[tuple[str, int]],
+) -> Iterator[ImageTask]:
+    """Yield what is to be done for images of these names and levels."""
+    initial = inputs.initial_cameras
+    has_database = context.workspace.database.exists()
+    cameras = context.graph.cameras if has_database else {}
+    uses_depth = extractor.options.uses_depth
+    names = inputs.names() if uses_depth else []
+    for name, level in images:
+        camera = cameras.get(name)
+        intrinsics = None
+        if uses_depth and camera:
+            intrinsics = colmap_database.camera_matrix(camera)
+        elif uses_depth:
+            intrinsics = initial.matrix(name, names)
+        yield ImageTask(
+            photographs=inputs.photographs,
+            name=name,
+            level=level,
+            intrinsics=intrinsics,
+            camera_size=(camera.width, camera.height) if camera else None,
+        )
 
 
 def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None:
@@ -229,12 +317,12 @@ def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None
         return
     ids = colmap_database.image_ids(workspace.database)
     with colmap_database.open_database(workspace.database) as database:
-        foreign = [n for n in names if n in ids and database.exists_keypoints(ids[n])]
-    if foreign:
-        raise DatabaseError(
-            f"{workspace.database}: has other features of {foreign[0]}; they are not replaced, "
-            "start a new database from it (from_database, --from-database)"
-        )
+        for name in names:
+            if name in ids and database.exists_keypoints(ids[name]):
+                raise DatabaseError(
+                    f"{workspace.database}: has other features of {name}; they are not replaced, "
+                    "start a new database from it (from_database, --from-database)"
+                )
 
 
 # Inputs that have changed since a run began: what was made from them is forgotten, and made again.
@@ -246,7 +334,9 @@ def _refuse_other_photographs(
     workspace: Workspace, image_path: str, contents: Mapping[str, Content]
 ) -> None:
     """Refuse another folder of photographs unless it has some that were worked on."""
-    before = (workspace.planned("extract") or {}).get("image_path", image_path)
+    before = (workspace.options_on_record("extract") or {}).get(
+        "image_path", image_path
+    )
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
         raise ConflictError(
@@ -258,8 +348,12 @@ def _refuse_other_photographs(
 
 def _changed(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:
     """Return the images whose files are not those any more that their features are from."""
-    both = [name for name in now if name in known and known[name].digest]
-    return [name for name in both if known[name].digest != now[name].digest]
+    changed = []
+    for name, content in now.items():
+        before = known.get(name, NOT_KNOWN).digest
+        if before and before != content.digest:
+            changed.append(name)
+    return changed
 
 
 def _forget_changed(
@@ -272,33 +366,39 @@ def _forget_changed(
     images. Returns one line by the folder of the photographs, empty if nothing has changed.
     """
     workspace = context.workspace
-    store = context.features
-    known = store.contents()
+    known = context.features.contents()
     changed = _changed(known, contents)
-    are_all = are_all and not workspace.users_database
-    gone = sorted(known.keys() - contents.keys()) if are_all else []
+    gone = list[str]()
+    if are_all and not workspace.users_database:
+        gone = sorted(known.keys() - contents.keys())
     cameras = inputs.cameras_digest()
-    has_others = bool(known) and workspace.made_from("cameras") != cameras
-    other_cameras = ["cameras are given otherwise"] if has_others else []
-    lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
-    if lines:
-        workspace.rewind(f"since it was made, {', '.join(lines)}")
+    reasons = [*_counted(changed, "changed"), *_counted(gone, "gone")]
+    if known and workspace.input_digest("cameras") != cameras:
+        reasons.append("cameras are given otherwise")
+    why = ", ".join(reasons)
+    if reasons:
+        workspace.rewind(f"since it was made, {why}")
         context.graph.forget()
         workspace.pairs.unlink(missing_ok=True)
-        context.matches.remove({*changed, *gone})
-        if changed or gone:
-            store.remove({*changed, *gone})
-    left = known.keys() & contents.keys() - set(changed)
-    if other := {
-        name: contents[name] for name in left if known[name] != contents[name]
-    }:
-        store.record_contents(other)
-    workspace.record_made_from(cameras=cameras)
-    if not lines:
+        lost = {*changed, *gone}
+        context.matches.remove(lost)
+        if lost:
+            context.features.remove(lost)
+    _record_new_stamps(context, contents, known)
+    workspace.record_input_digests(cameras=cameras)
+    if not reasons:
         return {}
-    return {
-        inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"
-    }
+    return {inputs.image_path: f"{why}; all that hangs on them is made again"}
+
+
+def _record_new_stamps(
+    context: Context, contents: Mapping[str, Content], known: Mapping[str, Content]
+) -> None:
+    """Put sizes and times on record of files that hold what they did, and were written again."""
+    unchanged = known.keys() & contents.keys() - set(_changed(known, contents))
+    others = [name for name in unchanged if known[name] != contents[name]]
+    if others:
+        context.features.record_contents({name: contents[name] for name in others})
 
 
 def _counted(names: Sequence[str], what: str) -> list[str]:
@@ -310,8 +410,10 @@ def _refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> N
     known = context.features.contents()
     now = inputs.contents(names, context.extraction, known)
     there = {name: content for name, content in now.items() if content.digest}
-    if changed := _counted(_changed(known, there), "changed"):
+    changed = _changed(known, there)
+    if changed:
+        what = _counted(changed, "changed")[0]
         raise StoreError(
-            f"{context.workspace.features}: {changed[0]} since their features were extracted; run "
+            f"{context.workspace.features}: {what} since their features were extracted; run "
             "extract again"
         )

@@ -28,7 +28,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.given_matches import MatchType, given_matches
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.project.paths import resolved
+from colmap_affrect.project.paths import as_path_or_none, resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.session.context import Context, source_files
@@ -49,9 +49,8 @@ class ForeignDatabase:
 
     path: Path
     image_path: Path | None = None  # folder of the photographs
-    cameras: CameraOptions = field(
-        default_factory=CameraOptions
-    )  # for images of the database
+    # For images of the database
+    cameras: CameraOptions = field(default_factory=CameraOptions)
     matches_path: Path | None = None  # matches of its keypoints
     match_type: MatchType = "raw"  # what those are
     match_list_path: Path | None = None  # pairs to match by descriptors; None: all
@@ -75,23 +74,26 @@ class ForeignDatabase:
     def of_record(cls, record: dict[str, Any]) -> "ForeignDatabase":
         """Return it from what a run keeps of it."""
         return cls(
-            Path(record["database"]),
-            Path(record["image_path"]) if record.get("image_path") else None,
-            CameraOptions.from_mapping(record.get("cameras", {}), "config.toml"),
-            Path(record["matches"]) if "matches" in record else None,
-            record.get("match_type", "raw"),
-            Path(record["match_list"]) if "match_list" in record else None,
+            path=Path(record["database"]),
+            image_path=as_path_or_none(record.get("image_path")),
+            cameras=CameraOptions.from_mapping(
+                record.get("cameras", {}), "config.toml"
+            ),
+            matches_path=as_path_or_none(record.get("matches")),
+            match_type=record.get("match_type", "raw"),
+            match_list_path=as_path_or_none(record.get("match_list")),
         )
 
     def digest(self) -> str:
         """Return a digest of all files that are given."""
-        database = content_of(source_files(self.path)).digest
-        others = [self.matches_path, self.match_list_path]
-        others.append(
-            Path(self.cameras.cameras_path) if self.cameras.cameras_path else None
+        paths = (
+            self.path,
+            self.matches_path,
+            self.match_list_path,
+            as_path_or_none(self.cameras.cameras_path),
         )
-        found = [content_of(source_files(path)).digest for path in others if path]
-        return digest_of([database, *found]) if found else database
+        digests = [content_of(source_files(path)).digest for path in paths if path]
+        return digest_of(digests) if len(digests) > 1 else digests[0]
 
     def check(self) -> None:
         """Refuse what names no file, or cameras of other images, before anything is made."""
@@ -108,59 +110,96 @@ class ForeignDatabase:
 
     def initial_cameras(self) -> InitialCameras:
         """Return the cameras that the user gives."""
-        options = self.cameras.changed(ignore_exif=True)
-        return InitialCameras(self.image_path or self.path.parent, options)
+        return InitialCameras(
+            self.image_path or self.path.parent,
+            self.cameras.changed(ignore_exif=True),
+        )
 
 
-def copy_verified(
+def import_and_verify(
     context: Context,
     foreign: ForeignDatabase,
     verification: VerificationOptions,
     *,
     overwrite: bool = False,
 ) -> StageReport:
-    """Copy a database, and verify its matched pairs that have no two-view geometry.
+    """Copy a database, match its images if nobody has, and verify pairs without geometry.
 
-    The copy is made anew when a given file has changed since, or with ``overwrite``. Raises
-    DatabaseError when it cannot be used, or has neither matches nor descriptors.
+    Args:
+        context: of the workspace that the copy goes into.
+        foreign: the database, and what is known beside it.
+        verification: of pairs that have no two-view geometry.
+        overwrite: make the copy anew, which is also done when a given file has changed.
+
+    Returns:
+        How many pairs were verified now, and how many before.
+
+    Raises:
+        DatabaseError: it cannot be used, or has neither matches nor descriptors.
     """
     start = time.perf_counter()
     workspace = context.workspace
-    source = foreign.path
     foreign.check()
     workspace.require_own(foreign.image_path)
+    warnings = _update_copy(context, foreign, overwrite=overwrite)
+    workspace.record_options("verify", verification.to_mapping())
+    _match(context, foreign)
+    num_pairs = colmap_database.num_matched_pairs(workspace.database)
+    if not num_pairs:
+        raise DatabaseError(f"{foreign.path}: has no matches; match its images first")
+    num_verified = _verify(context, foreign, verification)
+    return StageReport(
+        name="verify",
+        wall_s=time.perf_counter() - start,
+        num_done=num_verified,
+        num_kept=num_pairs - num_verified,
+        warnings=warnings,
+    )
+
+
+def _update_copy(
+    context: Context, foreign: ForeignDatabase, *, overwrite: bool
+) -> dict[str, str]:
+    """Make the copy, unless it is there and made from the same files; return a warning."""
+    workspace = context.workspace
+    source = foreign.path
     digest = foreign.digest()
-    if digest != workspace.made_from("copy") or not workspace.database.exists():
+    if digest != workspace.input_digest("copy") or not workspace.database.exists():
         refuse_unusable(source, warns=True)
-    workspace.record_options("copy", foreign.to_record(), overwrite=overwrite)
+    workspace.record_options("copy", options=foreign.to_record(), overwrite=overwrite)
     warnings = {}
-    if digest != (before := workspace.made_from("copy")):
+    before = workspace.input_digest("copy")
+    if digest != before:
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
             logger.warning("%s: %s", source, warnings[str(source)])
         workspace.rewind()
         context.graph.forget()
-        workspace.record_made_from(copy=digest)
+        workspace.record_input_digests(copy=digest)
     if not workspace.database.exists():
         known = _copy(context, foreign)
         context.graph.forget()
         record_cameras(context.graph.cameras, workspace.cameras, known=known)
     record_cameras(context.graph.cameras, workspace.cameras)
-    workspace.record_options("verify", verification.to_mapping())
-    _match(context, foreign)
-    num_pairs = colmap_database.num_matched_pairs(workspace.database)
-    if not num_pairs:
-        raise DatabaseError(f"{source}: has no matches; match its images first")
-    todo = len(colmap_database.unverified_pairs(workspace.database))
-    if todo:
+    return warnings
+
+
+def _verify(
+    context: Context, foreign: ForeignDatabase, verification: VerificationOptions
+) -> int:
+    """Verify the pairs that have matches only, and return how many they are."""
+    database_path = context.workspace.database
+    num_pairs = len(colmap_database.unverified_pairs(database_path))
+    if num_pairs:
         logger.warning(
-            "%s: %d pairs have matches only; they are verified now", source, todo
+            "%s: %d pairs have matches only; they are verified now",
+            foreign.path,
+            num_pairs,
         )
-    with context.progress.stage("verify", todo, "pairs") as advance:
-        verify(workspace.database, verification, advance=advance)
+    with context.progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(database_path, verification, advance=advance)
     context.graph.forget()
-    wall_s = time.perf_counter() - start
-    return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
+    return num_pairs
 
 
 def _copy(context: Context, foreign: ForeignDatabase) -> Records:
@@ -170,23 +209,33 @@ def _copy(context: Context, foreign: ForeignDatabase) -> Records:
     def change(database: pycolmap.Database) -> None:
         add_frames(database)
         records.update(foreign.initial_cameras().replace_cameras(database))
-        if not (foreign.matches_path or has_matches(foreign.path)):
+        if foreign.matches_path:
+            _write_given_matches(context, foreign, database)
+        elif not has_matches(foreign.path):
             database.clear_matches()  # rows of no matches
-        if not foreign.matches_path:
-            return
-        names = [
-            image.name
-            for image in database.read_all_images()
-            if database.exists_keypoints(image.image_id)
-        ]
-        with (
-            given_matches(foreign.matches_path, names) as found,
-            context.progress.stage("matches", len(found.pairs), "pairs") as advance,
-        ):
-            write_given_matches(database, found, foreign.match_type, advance)
 
     copy_database(foreign.path, context.workspace.database, FATAL, change)
     return records
+
+
+def _write_given_matches(
+    context: Context, foreign: ForeignDatabase, database: pycolmap.Database
+) -> None:
+    """Write the matches of a file into the copy."""
+    if not foreign.matches_path:
+        return
+    names = [
+        image.name
+        for image in database.read_all_images()
+        if database.exists_keypoints(image.image_id)
+    ]
+    with (
+        given_matches(foreign.matches_path, names) as found,
+        context.progress.stage("matches", len(found.pairs), "pairs") as advance,
+    ):
+        write_given_matches(
+            database, given=found, match_type=foreign.match_type, advance=advance
+        )
 
 
 def _match(context: Context, foreign: ForeignDatabase) -> None:

@@ -24,8 +24,9 @@ from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
+from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore, GuidedPair
+from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px
@@ -56,7 +57,12 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     todo, num_done = guiding.todo()
     with context.progress.stage("guide", len(todo), "pairs") as advance:
         guiding.guide(todo, advance)
-    return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
+    return StageReport(
+        name="guide",
+        wall_s=time.perf_counter() - start,
+        num_done=len(todo),
+        num_kept=num_done,
+    )
 
 
 def exact_inliers(
@@ -76,11 +82,8 @@ def current(context: Context) -> list[GuidedPair]:
     if not (context.workspace.guided.exists() and path.exists()):
         return []
     counts = context.graph.num_inliers(0)
-    return [
-        pair
-        for pair in context.guided.read()
-        if pair.num_inliers in (0, counts.get(pair.names))
-    ]
+    pairs = context.guided.read()
+    return [pair for pair in pairs if pair.num_inliers in (0, counts.get(pair.names))]
 
 
 def guided_counts(context: Context) -> dict[str, int]:
@@ -97,7 +100,7 @@ def guided_counts(context: Context) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class GuidedTask:
-    """A verified pair to match again; of its images the one with the lower id comes first."""
+    """A verified pair to match again; its image with the lower id comes first."""
 
     names: Pair  # of the two images
     model: PairModel  # its geometry, and all keypoints
@@ -124,10 +127,13 @@ class GuidedMatcher:
         """Return the (K, 2) inliers of a pair and its guided matches."""
         descriptors1, shapes1 = self._images(task.names[0])
         descriptors2, shapes2 = self._images(task.names[1])
-        descriptors = (descriptors1, descriptors2)
-        shapes = (shapes1, shapes2) if len(shapes1) and len(shapes2) else None
+        have_shapes = len(shapes1) and len(shapes2)
         return guided_matches(
-            descriptors, shapes, task.model, task.inliers, self._options
+            descriptors=(descriptors1, descriptors2),
+            shapes=(shapes1, shapes2) if have_shapes else None,
+            model=task.model,
+            inliers=task.inliers,
+            options=self._options,
         )
 
     def _read(self, name: str) -> tuple[Singles, Array]:
@@ -153,16 +159,14 @@ class Guiding:
         self.options = options
         self.ids = context.graph.ids
         max_size_px = context.extraction.max_image_size_px
-        sizes = context.features.image_sizes()
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
-        self.scales = {
-            name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()
-        }
+        sizes = context.features.image_sizes().items()
+        self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes}
         self.verifier = PairVerifier(
-            context.graph.ids,
-            context.graph.cameras,
-            context.verification,
-            extracted_px(context),
+            ids=context.graph.ids,
+            cameras=context.graph.cameras,
+            options=context.verification,
+            extracted_px=extracted_px(context),
         )
 
     def todo(self) -> tuple[list[Pair], int]:
@@ -188,7 +192,7 @@ class Guiding:
         """Return the images of those pairs that were matched again, and have enough."""
         if not pairs:
             return set()
-        asked = {frozenset(pair) for pair in pairs}
+        asked = set(map(frozenset, pairs))
         listed = [
             pair for pair in self.context.listed_pairs() if frozenset(pair) in asked
         ]
@@ -201,9 +205,9 @@ class Guiding:
             return set(self.ids)
         if self.options.enabled != "auto":
             return set()
-        names = {name for pair in exact for name in pair}
+        num_images = len(set[str]().union(*exact))
         # Of two images alone there are no longer tracks.
-        limit = self.options.min_num_tracks if len(names) > 2 else 0
+        limit = self.options.min_num_tracks if num_images > 2 else 0
         return weakly_connected_images(exact, limit)
 
     def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
@@ -225,13 +229,15 @@ class Guiding:
             tasks = self._tasks(batch)
             found = list[tuple[GuidedTask, Indices]]()
             matched = executor.map(matcher, tasks, [features.path])
+            without_model = set(batch)
             for task, matches in zip(tasks, matched, strict=True):
-                moving = stationary.left(task.names, matches)
+                moving = stationary.keep_mask(task.names, matches)
                 found.append((task, matches[moving]))
+                without_model.discard(task.names)
                 advance(1)
-            without_model = set(batch).difference(task.names for task in tasks)
             self.context.guided.write(
-                GuidedPair(names, NOTHING, 0) for names in sorted(without_model)
+                GuidedPair(names=names, exact=NOTHING, num_inliers=0)
+                for names in sorted(without_model)
             )
             advance(len(without_model))
             self._keep(found)
@@ -239,25 +245,32 @@ class Guiding:
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what is to be done for the pairs whose geometry says where matches may be."""
         tasks = []
-        with self.context.graph.reading() as database:
+        with self.context.graph.open_to_read() as database:
             cameras = cameras_of_images(database)
             for names in pairs:
                 first = self.ids[names[0]]
                 second = self.ids[names[1]]
-                keypoints = (
-                    database.read_keypoints(first),
-                    database.read_keypoints(second),
-                )
                 geometry = database.read_two_view_geometry(first, second)
                 model = pair_model(
-                    geometry, (cameras[first], cameras[second]), keypoints
+                    geometry,
+                    cameras=(cameras[first], cameras[second]),
+                    keypoints=(
+                        database.read_keypoints(first),
+                        database.read_keypoints(second),
+                    ),
                 )
                 if not model:
                     continue
-                inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-                scaled = model.scaled(self.scales[names[0]], self.scales[names[1]])
-                is_calibrated = geometry.config == CALIBRATED
-                tasks.append(GuidedTask(names, scaled, inliers, is_calibrated))
+                inliers = np.asarray(geometry.inlier_matches, np.int64)
+                scales = (self.scales[names[0]], self.scales[names[1]])
+                tasks.append(
+                    GuidedTask(
+                        names=names,
+                        model=model.scaled(*scales),
+                        inliers=inliers.reshape(-1, 2),
+                        is_calibrated=geometry.config == CALIBRATED,
+                    )
+                )
         return tasks
 
     def _keep(self, found: Sequence[tuple[GuidedTask, Indices]]) -> None:
@@ -268,24 +281,30 @@ class Guiding:
             if len(matches) <= len(task.inliers):
                 continue
             first, second = task.names
-            frames = (features.read_frames(first), features.read_frames(second))
-            geometry = self.verifier.geometry(task.names, frames, matches)
+            geometry = self.verifier.geometry(
+                task.names,
+                frames=(features.read_frames(first), features.read_frames(second)),
+                indices=matches,
+            )
             if _is_better(geometry, task):
                 geometries[task.names] = geometry
-        counts = {
-            names: len(geometry.inlier_matches)
-            for names, geometry in geometries.items()
-        }
-        self.context.guided.write(
-            GuidedPair(task.names, task.inliers, counts.get(task.names, 0))
-            for task, _ in found
-        )
+        pairs = []
+        for task, _ in found:
+            better = geometries.get(task.names)
+            pairs.append(
+                GuidedPair(
+                    names=task.names,
+                    exact=task.inliers,
+                    num_inliers=len(better.inlier_matches) if better else 0,
+                )
+            )
+        self.context.guided.write(pairs)
         self._write(geometries)
 
     def _write(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         if not geometries:
             return
-        with self.context.graph.opened(for_pairs=True) as database:
+        with self.context.graph.open_to_change(for_pairs=True) as database:
             for names, geometry in geometries.items():
                 first, second = names
                 database.update_two_view_geometry(

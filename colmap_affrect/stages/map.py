@@ -18,7 +18,7 @@ from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.reasons import Missing
-from colmap_affrect.project.record import OWN, MappedFrom
+from colmap_affrect.project.record import OWN, ModelInputs
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
@@ -56,7 +56,7 @@ def map_images(
     workspace.require("verify")
     inputs = _inputs(context, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = None if workspace.lacks_models() else workspace.mapped_from()
+    known = None if workspace.lacks_models() else workspace.model_inputs()
     if known and known != inputs and known.extends and not extend:
         raise ConflictError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
@@ -73,10 +73,10 @@ def map_images(
         before = _models_before(workspace.sparse, known_models)
     context.graph.close()  # mappers open the database, and SQLite's own copy copies it
     task = _task(context, extend, before)
-    workspace.record_mapped(None)  # a run that is killed begins anew
+    workspace.record_mapping(None)  # a run that is killed begins anew
     with context.progress.stage("map", len(context.graph.ids), "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
-    workspace.record_mapped(inputs)
+    workspace.record_mapping(inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
 
@@ -149,13 +149,13 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
     return [pair for pair, level in levels.items() if not is_measured[level]]
 
 
-def _inputs(context: Context, extend: Extension | None) -> MappedFrom:
+def _inputs(context: Context, extend: Extension | None) -> ModelInputs:
     """Return what is mapped, and of which model that is extended."""
     if not extend:
-        return context.to_map()
+        return context.current_model_inputs()
     folder = resolved(model_folder(extend.model_path))
     own = folder.is_relative_to(resolved(context.workspace.sparse))
-    return context.to_map(OWN if own else extend.digest())
+    return context.current_model_inputs(OWN if own else extend.digest())
 
 
 def agreements(
@@ -165,7 +165,7 @@ def agreements(
 
     The strongest pairs of each photograph in the model count, the lower id of the database first.
     """
-    with verified.reading() as database:
+    with verified.open_to_read() as database:
         graph = PairGraph.of(database, 1)
     ids = {
         name: image_id for image_id, name in graph.names.items()

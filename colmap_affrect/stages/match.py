@@ -86,7 +86,7 @@ def match(
     _record_options(context, options, overwrite=overwrite)
     missing = _match_missing(context, pairs, options)
     write_images_and_keypoints(context)
-    with context.graph.opened(for_pairs=True) as database:
+    with context.graph.open_to_change(for_pairs=True) as database:
         write_matches(context, database, pairs)
     wall_s = time.perf_counter() - start
     num_before = len(pairs) - missing.num
@@ -131,7 +131,7 @@ def _match_missing(
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
-        matches.keep(listed="")
+        matches.update_state(listed="")
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
@@ -146,7 +146,7 @@ def _match_missing(
             warnings["matches"] = line
             logger.warning("matches: %s", line)
     if finished != digest:
-        matches.keep(listed=digest)
+        matches.update_state(listed=digest)
     return _Missing(len(missing), warnings)
 
 
@@ -163,7 +163,7 @@ def load_matchers(
     learned = {matcher for matcher in usable if matcher.weights}
     keys = set[str]().union(*(matcher.weights for matcher in learned))
     weights = resolve(sorted(keys), resources.weights_path)
-    if "match" not in context.workspace.begun:
+    if "match" not in context.workspace.started_stages:
         for matcher in learned:
             MATCHERS.make(matcher, MatcherContext(weights, "cpu"))
     return weights
@@ -216,7 +216,7 @@ def _is_in_vain(
             num_after = _sum_confirming(context.features, found)
         num_before = _sum_confirming(context.features, matches.read(sample))
         known = (digest, num_after < MIN_GROWTH * num_before)
-        matches.keep(in_vain=known)
+        matches.update_state(in_vain=known)
     return known == (digest, True)
 
 
@@ -285,7 +285,7 @@ def matched_at_level(
     stationary = StationaryFilter(context.features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
         for found in found_pairs:
-            yield stationary.filtered(found)
+            yield stationary.without_stationary(found)
 
 
 # What is done for one pair, in a thread of this process or on a worker of a cluster.

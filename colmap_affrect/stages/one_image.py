@@ -86,23 +86,18 @@ class ImageExtractor:
     """
 
     options: ExtractionOptions  # of the recipe
-    extractors: Mapping[
-        int, FeatureExtractor
-    ]  # by level, but those that wait for weights
+    # By level, but those that wait for weights
+    extractors: Mapping[int, FeatureExtractor]
     rectifiers: Mapping[int, Rectifier]  # of the same levels
-    weights: Mapping[str, Path] = field(
-        default_factory=dict
-    )  # files of the networks by key
+    # Files of the networks by key
+    weights: Mapping[str, Path] = field(default_factory=dict)
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
-    # held while networks run, which take one image at a time
+    # Held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(default_factory=Lock)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _prepared_elsewhere, (
-            self.options,
-            self.resources,
-            digests(self.weights),
-        )
+        sent = digests(self.weights)
+        return _prepare_elsewhere, (self.options, self.resources, sent)
 
     def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
@@ -111,10 +106,10 @@ class ImageExtractor:
             mask = task.photographs.mask(task.name)
             found = self.extract_file(
                 path,
-                task.name,
-                task.intrinsics,
-                task.level,
-                mask,
+                name=task.name,
+                intrinsics=task.intrinsics,
+                level=task.level,
+                mask=mask,
                 with_lines=task.level == 0,
             )
         except ImageError as error:
@@ -159,11 +154,8 @@ class ImageExtractor:
             ImageError: the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
-        with (
-            self.network_lock
-            if self.options.levels[level].uses_networks
-            else nullcontext()
-        ):
+        uses_networks = self.options.levels[level].uses_networks
+        with self.network_lock if uses_networks else nullcontext():
             plan, warning = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
@@ -173,10 +165,13 @@ class ImageExtractor:
         keep = is_inside(features.keypoints, original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
-        kept = features.select(keep)
-        lines = lines_of(photograph.gray, photograph.mask) if with_lines else None
+
         return ExtractedImage(
-            kept, original_size, warning, photograph.stretched, lines=lines
+            features=features.select(keep),
+            image_size=original_size,
+            warning=warning,
+            stretched=photograph.stretched,
+            lines=lines_of(photograph.gray, photograph.mask) if with_lines else None,
         )
 
     def photograph(
@@ -187,11 +182,21 @@ class ImageExtractor:
         mask: Mask | None = None,
         level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:
-        """Read an image at the size of processing; also return its stored (width, height)."""
+        """Read an image at the size of processing; also return its stored (width, height).
+
+        Args:
+            path: the file.
+            name: key of its depth map; empty: the file's name.
+            intrinsics: (3, 3) in pixel-centre px as stored; None: COLMAP's guess.
+            mask: (H, W) bool of the stored image, where features may be.
+            level: of escalation, which may have a size of its own.
+
+        Raises:
+            ImageError: the file cannot be read.
+        """
         stored = reading.decode(path)
-        black_and_white = (
-            reading.tones(stored) if self.options.stretch_contrast else None
-        )
+        stretches = self.options.stretch_contrast
+        black_and_white = reading.tones(stored) if stretches else None
         image = reading.in_eight_bits(stored, black_and_white)
         original_size = (image.shape[1], image.shape[0])
         chosen = self.options.levels[level]
@@ -199,26 +204,33 @@ class ImageExtractor:
         gray = reading.shrink_to(image, limit)
         color = None
         if chosen.features.in_color:
-            color = reading.read_color(
-                path, limit, stretch=self.options.stretch_contrast
-            )
+            color = reading.read_color(path, max_size_px=limit, stretch=stretches)
         size = (gray.shape[1], gray.shape[0])
-        original_camera = (
-            camera_matrix(original_size) if intrinsics is None else intrinsics
+        if intrinsics is None:
+            intrinsics = camera_matrix(original_size)
+        photograph = Photograph(
+            gray=gray,
+            name=name or path.name,
+            path=path,
+            camera_matrix=resized_from_original(original_size, size) @ intrinsics,
+            mask=None if mask is None else reading.shrink_mask(mask, size),
+            color=color,
+            stretched=black_and_white is not None,
         )
-        camera = resized_from_original(original_size, size) @ original_camera
-        if mask is not None:
-            mask = reading.shrink_mask(mask, size)
-        stretched = black_and_white is not None
-        found = Photograph(
-            gray, name or path.name, path, camera, mask, color, stretched
-        )
-        return found, original_size
+        return photograph, original_size
 
     def plan(
         self, photograph: Photograph, level: int = 0
     ) -> tuple[RectificationPlan, str]:
-        """Decide which warps to look at; without a usable depth map none, and say why."""
+        """Decide which warps to look at.
+
+        Args:
+            photograph: at the size of processing.
+            level: of escalation.
+
+        Returns:
+            The plan, and why it has no warps where a depth map cannot be used; else empty.
+        """
         if min(photograph.size) < MIN_RECTIFIABLE_PX:
             return RectificationPlan(photograph.size), ""
         try:
@@ -229,16 +241,24 @@ class ImageExtractor:
     def execute(
         self, photograph: Photograph, plan: RectificationPlan, level: int = 0
     ) -> LocalFeatures:
-        """Extract the features of a level's plan, frames in px of the photograph.
+        """Extract the features of a level's plan.
 
-        Those of the image itself only where no lower level has them.
+        Those of the image itself are extracted only where no lower level has them.
+
+        Args:
+            photograph: at the size of processing.
+            plan: its warps.
+            level: of escalation.
+
+        Returns:
+            The features, LAFs in px of the photograph.
         """
         chosen = self.options.levels[level]
         return extract_rectified(
             photograph.gray if photograph.color is None else photograph.color,
             plan,
-            self.extractors[level],
-            chosen.features.max_num_rectified_features,
+            extractor=self.extractors[level],
+            max_num_rectified=chosen.features.max_num_rectified_features,
             with_original=chosen.base == level,
             mask=photograph.mask,
         )
@@ -250,9 +270,12 @@ def num_images_at_once(levels: Collection[Level]) -> int:
     They take at most half of the memory there is. With networks at most two: one is read while
     the networks run on the other.
     """
-    num_bytes = max(x.features.bytes_per_px * x.max_image_size_px**2 for x in levels)
-    most = 2 if any(level.uses_networks for level in levels) else available_cores()
-    return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
+    needed = [
+        level.features.bytes_per_px * level.max_image_size_px**2 for level in levels
+    ]
+    uses_networks = any(level.uses_networks for level in levels)
+    most = 2 if uses_networks else available_cores()
+    return min(most, max(1, available_memory_bytes() // 2 // max(needed)))
 
 
 def prepare(
@@ -263,43 +286,69 @@ def prepare(
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
-    Levels of escalation whose weights are not here are left out. ``image_names`` are those to come,
-    to see whether there are depth maps for them. AffrectError when a file of weights is neither
-    found nor downloaded, or the device is not there, OptionError when depth maps are needed and no
-    source is given, DepthError when the folder of depth maps has none of the images.
+    Levels of escalation whose weights are not here are left out.
+
+    Args:
+        options: of the recipe.
+        resources: weights and device; None: the usual places, and any device.
+        image_names: of the images to come, to see whether there are depth maps for them; None: do
+            not look.
+        progress: where to show downloads.
+
+    Returns:
+        What is called for every photograph.
+
+    Raises:
+        AffrectError: a file of weights is neither found nor downloaded, or the device is not there.
+        OptionError: depth maps are needed, and no folder is given, or it has none of the images.
     """
     resources = resources or Resources()
     options.check_depth()
     levels = {k: options.levels[k] for k in resources.usable_levels(options)}
-    parts = {part for level in levels.values() for part in level.network_parts}
-    keys = sorted({key for part in parts for key in part.weights})
-    weights = resolve(keys, resources.weights_path, progress=progress)
+    keys = set[str]()
+    for level in levels.values():
+        for part in level.network_parts:
+            keys.update(part.weights)
+    weights = resolve(sorted(keys), resources.weights_path, progress=progress)
     uses_network = any(level.uses_networks for level in options.levels)
-    device = resources.require_device(uses_network=uses_network)
-    network = NetworkContext(weights, device)
+    network = NetworkContext(
+        weights, resources.require_device(uses_network=uses_network)
+    )
+    extractor_of = cache(lambda features: EXTRACTORS.make(features, network))
+    extractors = {k: extractor_of(level.features) for k, level in levels.items()}
     depth = None
-    extractor = cache(lambda features: EXTRACTORS.make(features, network))
-    extractors = {k: extractor(level.features) for k, level in levels.items()}
     if options.uses_depth:
         depth = DepthMaps(options.depth)
         if image_names is not None:
             depth.require_some(image_names)
-    shapes = cache(lambda source, features: SHAPES.make(source, network, features))
+    return ImageExtractor(
+        options=options,
+        extractors=extractors,
+        rectifiers=_rectifiers(levels, network, depth),
+        weights=weights,
+        resources=resources,
+    )
 
-    def rectifier(level: Level) -> Rectifier:
+
+def _rectifiers(
+    levels: Mapping[int, Level], network: NetworkContext, depth: DepthMaps | None
+) -> dict[int, Rectifier]:
+    """Build the rectifiers of levels; those of equal shape sources share one."""
+    source_of = cache(lambda source, features: SHAPES.make(source, network, features))
+    rectifiers = {}
+    for number, level in levels.items():
         item = level.rectifier
-        source = None
-        if isinstance(item, CoverOptions):
-            source = shapes(item.shape_source, level.features)
-        return RECTIFIERS.make(
-            item, RectifierInputs(source, depth if item.uses_depth else None)
+        inputs = RectifierInputs(
+            source_of(item.shape_source, level.features)
+            if isinstance(item, CoverOptions)
+            else None,
+            depth if item.uses_depth else None,
         )
+        rectifiers[number] = RECTIFIERS.make(item, inputs)
+    return rectifiers
 
-    rectifiers = {k: rectifier(level) for k, level in levels.items()}
-    return ImageExtractor(options, extractors, rectifiers, weights, resources)
 
-
-def _prepared_elsewhere(
+def _prepare_elsewhere(
     options: ExtractionOptions, resources: Resources, sent: Mapping[str, str]
 ) -> ImageExtractor:
     """Prepare a recipe in another process."""

@@ -31,10 +31,19 @@ def choose_pairs(
 ) -> StageReport:
     """Write the list of the pairs to match: by default every pair of images.
 
-    When images are added, pairs that were chosen by other options than these, which are by default
-    those on record, stay; ``overwrite`` discards them first, and what was made of them. Raises
-    AffrectError when the list cannot be used, DatabaseError when there are no positions to choose
-    by, StoreError when earlier pairs are missing in the list, or other options made them.
+    Args:
+        context: of the workspace, whose photographs have features.
+        options: which pairs; None: those on record. When images are added, pairs stay that were
+            chosen before.
+        overwrite: discard the list that is there, and what was made of it.
+
+    Returns:
+        How many pairs are listed.
+
+    Raises:
+        AffrectError: the list that is given cannot be used.
+        DatabaseError: there are no positions to choose by.
+        StoreError: earlier pairs are missing in the list, or other options made them.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -42,28 +51,44 @@ def choose_pairs(
     workspace.require("extract")
     listed = options.match_list_path
     if "exhaustive" in options.methods and not listed:
-        names = context.features.names()
-        count = math.comb(len(names), 2)
-        if len(names) > MANY_IMAGES:
-            logger.warning(MANY_PAIRS, len(names), count)
-        workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
-        every = combinations(names, 2)  # too many to keep in memory
-        lists.write_pairs(workspace.pairs, every, names)
-        workspace.record_made_from(pairs="")
-        return StageReport("pairs", time.perf_counter() - start, count)
+        num_pairs = _list_all_pairs(context, options, overwrite=overwrite)
+        return StageReport(
+            name="pairs", wall_s=time.perf_counter() - start, num_done=num_pairs
+        )
     pairs = _given_pairs(context, options)
-    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+    workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
     digest = content_of([Path(listed)]).digest if listed else ""
-    if workspace.made_from("pairs") not in ("", digest):
+    if workspace.input_digest("pairs") not in ("", digest):
         kept = set()
-    pairs |= kept | _similar_pairs(context, options, kept)
+    pairs |= kept | _similar_pairs(context, options, there=kept)
     warnings = _forget_lost(context, there - pairs)
     lists.write_pairs(workspace.pairs, sorted(pairs))
-    workspace.record_made_from(pairs=digest)
+    workspace.record_input_digests(pairs=digest)
     return StageReport(
-        "pairs", time.perf_counter() - start, len(pairs), warnings=warnings
+        name="pairs",
+        wall_s=time.perf_counter() - start,
+        num_done=len(pairs),
+        warnings=warnings,
     )
+
+
+def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) -> int:
+    """Write a list of all pairs of images, and return how many they are."""
+    workspace = context.workspace
+    names = context.features.names()
+    num_pairs = math.comb(len(names), 2)
+    # 45,000 pairs are too many to wait for; of mapping it says nothing
+    if len(names) > MANY_IMAGES:
+        logger.warning(MANY_PAIRS, len(names), num_pairs)
+    workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
+    lists.write_pairs(
+        workspace.pairs,
+        pairs=combinations(names, 2),  # too many to keep in memory
+        names=names,
+    )
+    workspace.record_input_digests(pairs="")
+    return num_pairs
 
 
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
@@ -72,24 +97,30 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     pairs = set[Pair]()
     known = set(names)
     if "sequence" in options.methods:
-        pairs |= set(lists.sequence_pairs(names, options.num_neighbors))
+        pairs.update(lists.sequence_pairs(names, options.num_neighbors))
     if "gps" in options.methods:
         write_images_and_keypoints(context)
-        limits = options.num_neighbors, options.max_distance_m
-        near = nearest_positions(context.workspace.database, *limits)
+        near = nearest_positions(
+            context.workspace.database,
+            options.num_neighbors,
+            options.max_distance_m,
+        )
         by_gps = {pair for pair in near if known.issuperset(pair)}
-        _say_lonely(context, names, by_gps, options)
+        _warn_of_images_without_neighbors(context, names, pairs=by_gps, options=options)
         pairs |= by_gps
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
-        folder = Path(context.inputs.image_path)
-        listed = lists.read_pairs(Path(options.match_list_path), sorted(named), folder)
-        pairs |= {pair for pair in listed if known.issuperset(pair)}
+        listed = lists.read_pairs(
+            Path(options.match_list_path),
+            names=sorted(named),
+            image_path=Path(context.inputs.image_path),
+        )
+        pairs.update(filter(known.issuperset, listed))
     return pairs
 
 
-def _say_lonely(
+def _warn_of_images_without_neighbors(
     context: Context,
     names: Sequence[str],
     pairs: Collection[Pair],
@@ -103,8 +134,9 @@ def _say_lonely(
             f"{context.workspace.database}: by its position no photograph was taken {near}; "
             f"{advice}"
         )
-    paired = {name for pair in pairs for name in pair}
-    if lonely := [name for name in names if name not in paired]:
+    paired = set[str]().union(*pairs)
+    lonely = [name for name in names if name not in paired]
+    if lonely:
         logger.warning(
             "gps: %d of %d photographs were not taken %s, or nobody knows where (%s); %s",
             len(lonely), len(names), near, such_as(lonely), advice,
@@ -118,10 +150,17 @@ def _similar_pairs(
     features = context.features
     progress = context.progress
     names = [name for name, count in features.num_keypoints().items() if count]
-    are_paired = {name for pair in there for name in pair}.issuperset(names)
+    are_paired = set[str]().union(*there).issuperset(names)
     if len(names) < 2 or are_paired or "retrieval" not in options.methods:
         return set()
-    return set(retrieved_pairs(names, features.read, options.num_neighbors, progress))
+    return set(
+        retrieved_pairs(
+            names,
+            features.read,
+            num_neighbors=options.num_neighbors,
+            progress=progress,
+        )
+    )
 
 
 def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
@@ -134,9 +173,8 @@ def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
 
 def _pairs_there(context: Context) -> set[Pair]:
     path = context.workspace.pairs
-    return (
-        set(context.listed_pairs()) if path.exists() and path.stat().st_size else set()
-    )
+    has_pairs = path.exists() and path.stat().st_size > 0
+    return set(context.listed_pairs()) if has_pairs else set()
 
 
 def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:

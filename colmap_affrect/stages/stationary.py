@@ -8,12 +8,13 @@ same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stationary`.
 
 import logging
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
+from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
 from colmap_affrect.data import Mask
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.stationary import (
@@ -21,7 +22,7 @@ from colmap_affrect.geometry.stationary import (
     num_moving_together,
     stationary_log_ratios,
 )
-from colmap_affrect.images.reading import grown
+from colmap_affrect.images.reading import grow_mask
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
@@ -101,7 +102,7 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features = features
         self._matches = matches
-        self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
+        self._points = lru_cache(NUM_CACHED_IMAGES)(self._read_points)
         self._places = dict[Size, Mask]()
         self._of_still_cameras = set(matches.state.still_cameras)
         for size, cells in matches.state.stationary:
@@ -114,25 +115,36 @@ class StationaryFilter:
     def _sizes(self) -> dict[str, Size]:
         return self._features.image_sizes()
 
-    def filtered(self, found: PairMatches) -> PairMatches:
+    def _read_points(self, name: str) -> Floats:
+        """Return the (N, 2) keypoints of an image in pixel-centre px."""
+        return self._features.read_frames(name)[:, :, 2]
+
+    def without_stationary(self, found: PairMatches) -> PairMatches:
         """Return the matches of a pair without those of captions, frames and watermarks."""
-        left = self.left(found.names, found.indices)
+        left = self.keep_mask(found.names, found.indices)
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
-    def left(self, names: Pair, indices: Indices) -> Mask:
-        """Return which (M, 2) matches of a pair are kept.
+    def keep_mask(self, names: Pair, indices: Indices) -> Mask:
+        """Return which matches of a pair are kept.
 
         Left out is what does not move at a place where nothing does, or beside it, since what is
         faint matches less; and what goes from one such place to another, as of equal letters. Of a
         pair that shows the same background, also what begins or ends on it, as of equal windows;
         and what does not move to the pixel, where the camera stood still.
+
+        Args:
+            names: of both images.
+            indices: (M, 2) int64 numbers of their features.
+
+        Returns:
+            (M,) bool.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
             return np.ones(len(indices), bool)
         still, first, second = self._still(names, indices, size)
         places = self._places[size]
-        near = grown(places, 1)
+        near = grow_mask(places, 1)
         both = near if near.mean() <= MAX_SHARE_BESIDE else places
         if both.mean() > MAX_SHARE_BESIDE:
             both = np.zeros_like(places)
@@ -164,7 +176,9 @@ class StationaryFilter:
         for size, places in found.items():
             if not places.still.any():
                 continue
-            if places.is_most and not self._moves_elsewhere(pairs, size, places.still):
+            if places.is_most and not self._moves_elsewhere(
+                pairs, size, places=places.still
+            ):
                 idle = CAMERA_STANDS_STILL
             else:
                 self._places[size] = places.still | self._places.get(size, places.still)
@@ -173,11 +187,11 @@ class StationaryFilter:
         if not self._places:
             return idle
         self._learn_backgrounds(pairs)
-        self._keep()
+        self._record()
         num_pairs = num_matches = 0
         for pair in pairs:
             (before,) = self._matches.read([pair])
-            after = self.filtered(before)
+            after = self.without_stationary(before)
             if len(after.indices) < len(before.indices):
                 self._matches.write([after])
                 num_pairs += 1
@@ -192,9 +206,8 @@ class StationaryFilter:
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""
         votes: dict[str, _Votes] = defaultdict(_Votes.none)
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) in self._places]
-        ):
+        of_sizes = [pair for pair in pairs if self._common_size(pair) in self._places]
+        for found in self._matches.read(of_sizes):
             size = self._sizes[found.names[0]]
             are_still, first, second = self._still(found.names, found.indices, size)
             for name, cells in zip(found.names, (first, second), strict=True):
@@ -207,7 +220,7 @@ class StationaryFilter:
                     name, background
                 )
 
-    def _keep(self) -> None:
+    def _record(self) -> None:
         """Put what is known on record."""
         kept = []
         for size, mask in self._places.items():
@@ -215,7 +228,7 @@ class StationaryFilter:
         packed = []
         for name, background in self._backgrounds.items():
             packed.append((name, _packed(background)))
-        self._matches.keep(
+        self._matches.update_state(
             stationary=tuple(kept),
             still_cameras=tuple(sorted(self._of_still_cameras)),
             backgrounds=tuple(packed),
@@ -231,9 +244,7 @@ class StationaryFilter:
         images: dict[Size, Mask] = defaultdict(
             lambda: np.zeros((*cells, len(numbers)), bool)
         )
-        for found in self._matches.read(
-            [pair for pair in pairs if self._common_size(pair)]
-        ):
+        for found in self._matches.read(list(filter(self._common_size, pairs))):
             size = self._sizes[found.names[0]]
             are_still, first, _ = self._still(found.names, found.indices, size)
             matched[size] += _mask(first)
@@ -243,18 +254,17 @@ class StationaryFilter:
                 images[size][unmoved, numbers[name]] = True
         places = {}
         for size, counts in matched.items():
-            likely = (still[size] >= MIN_NUM_PAIRS) & (
-                still[size] >= MIN_SHARE * counts
-            )
+            likely = still[size] >= MIN_NUM_PAIRS
+            likely &= still[size] >= MIN_SHARE * counts
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
-                num_likely = likely.sum()
-                num_matched = (counts >= MIN_NUM_PAIRS).sum()
-                num_exact = (likely & exact).sum()
-                is_most = bool(num_likely > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
-                is_most_exact = bool(num_exact > MAX_SHARE_OF_PHOTOGRAPH * num_matched)
-                places[size] = _Places(likely & exact, is_most, is_most_exact)
+                limit = MAX_SHARE_OF_PHOTOGRAPH * (counts >= MIN_NUM_PAIRS).sum()
+                places[size] = _Places(
+                    still=likely & exact,
+                    is_most=bool(likely.sum() > limit),
+                    is_most_exact=bool((likely & exact).sum() > limit),
+                )
         return places
 
     def _evidence(self, pairs: Sequence[Pair], size: Size, likely: Mask) -> Array:
@@ -267,20 +277,24 @@ class StationaryFilter:
         limit_px = MAX_MOTION_FRAC * max(size)
         tolerance_px = _tolerance_px(size)
         own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) == size]
-        ):
+        for found in self._matches_of_size(pairs, size):
             are_still, first, _ = self._still(found.names, found.indices, size)
             cells = first[are_still]
             if not _at(likely, cells).any():
                 continue
             points, others = self._ends(found.names, found.indices[are_still])
             ratios = stationary_log_ratios(
-                points, others - points, tolerance_px, limit_px
+                points,
+                motions=others - points,
+                tolerance_px=tolerance_px,
+                limit_px=limit_px,
             )
             own += _means(cells, ratios)
             connected += _means(
-                cells, means_of_regions(cells, ratios, NUM_CELLS, CONNECTED)
+                cells,
+                means_of_regions(
+                    cells, values=ratios, num_cells=NUM_CELLS, reach=CONNECTED
+                ),
             )
         return np.minimum(own, connected)
 
@@ -288,17 +302,25 @@ class StationaryFilter:
         """Tell whether enough matches of some pairs move together outside of places."""
         num_pairs = 0
         names = set[str]()
-        for found in self._matches.read(
-            [p for p in pairs if self._common_size(p) == size]
-        ):
+        for found in self._matches_of_size(pairs, size):
             are_still, first, second = self._still(found.names, found.indices, size)
             are_moving = ~(are_still | _at(places, first) | _at(places, second))
             points, others = self._ends(found.names, found.indices[are_moving])
             near_px = max(size) / NUM_CELLS
-            if num_moving_together(points, others - points, near_px) >= MIN_MOVING:
+            if (
+                num_moving_together(points, motions=others - points, radius_px=near_px)
+                >= MIN_MOVING
+            ):
                 num_pairs += 1
                 names.update(found.names)
         return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
+
+    def _matches_of_size(
+        self, pairs: Sequence[Pair], size: Size
+    ) -> Iterator[PairMatches]:
+        """Return the matches of the pairs whose photographs both have a size."""
+        of_size = [pair for pair in pairs if self._common_size(pair) == size]
+        return self._matches.read(of_size)
 
     def _still(
         self, names: Pair, indices: Indices, size: Size
@@ -319,9 +341,8 @@ class StationaryFilter:
 
     def _ends(self, names: Pair, indices: Indices) -> tuple[Floats, Floats]:
         """Return the (M, 2) px of matches in both images."""
-        first, second = (
-            self._points(name)[indices[:, side]] for side, name in enumerate(names)
-        )
+        first = self._points(names[0])[indices[:, 0]]
+        second = self._points(names[1])[indices[:, 1]]
         return first, second
 
     def _common_size(self, pair: Pair) -> Size | None:

@@ -66,7 +66,7 @@ def update_verified(
     """
     write_images_and_keypoints(context)
     sizes_px = extracted_px(context)
-    with context.graph.opened(for_pairs=True) as database:
+    with context.graph.open_to_change(for_pairs=True) as database:
         write_matches(context, database, pairs, replaces=replaces)
         todo = colmap_database.pairs_to_verify(database)
         if len(todo):

@@ -215,7 +215,7 @@ def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     assert (report["preset"], report["mapper"]) == ("colmap", "incremental")
     assert report["mapper_options"] == given
     assert report["verification"]["min_num_inliers"] == 15
-    record = Workspace(verified).recorded()["map"]
+    record = Workspace(verified).record()["map"]
     assert record["name"] == "incremental"
     assert record["mapper_options"]["triangulation.min_angle"] == 1.25
     again = ["map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper"]

@@ -21,7 +21,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Finding, diagnose
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.project.record import MappedFrom
+from colmap_affrect.project.record import ModelInputs
 from colmap_affrect.project.workspace import Workspace
 
 NUM_IMAGES = 3
@@ -163,7 +163,7 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     ]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
-            Workspace(folders.out).record_mapped(MappedFrom(inputs))
+            Workspace(folders.out).record_mapping(ModelInputs(inputs))
         for arguments in (["map", "--output-path", out], ["export", *target]):
             assert main([*arguments, "--quiet"]) == 1
             (line,) = capsys.readouterr().err.splitlines()

@@ -74,7 +74,7 @@ def matched(
         photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
     )
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.keep(learned_matching=Begun(1, tuple(escalation.state.pairs)))
+    escalation.matches.update_state(learned_matching=Begun(1, tuple(escalation.state.pairs)))
     assert escalation.match_learned() == len(escalation.state.pairs)
     return workspace
 
@@ -186,7 +186,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
         context.matches.state.modelled == context.matches.state.listed
     )  # are gone on from
     assert context.matches.state.follows == ""
-    assert context.workspace.mapped_from() == context.to_map()
+    assert context.workspace.model_inputs() == context.current_model_inputs()
     assert levels(context) == {1}
     ids = image_ids(context.workspace.database)
     with open_database(context.workspace.database) as database:
@@ -373,7 +373,7 @@ def test_what_was_looked_at_is_of_the_listed_pairs_and_of_what_is_said_by_hand(
     assert not learned_models_on_record(
         replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
     )
-    context.matches.keep(listed="another list")
+    context.matches.update_state(listed="another list")
     assert not learned_models_on_record(context)
 
 
@@ -399,7 +399,7 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
     pairs = list(escalation.state.pairs)
-    context.matches.keep(learned_matching=None)
+    context.matches.update_state(learned_matching=None)
     monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
     assert not escalation.plan_learned_matching()  # all have learned matches
     context.matches.remove(pairs=pairs)
@@ -420,7 +420,7 @@ def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
     context: Context,
 ) -> None:
     pairs = list(escalation_of(context).state.pairs)
-    context.matches.keep(learned_models=LearnedModels("set", 1.0, True, 0.5))
+    context.matches.update_state(learned_models=LearnedModels("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
     assert context.matches.state.learned_models is None

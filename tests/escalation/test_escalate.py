@@ -279,8 +279,8 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
     before: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = Escalation(Context(before), EscalateOptions())
-    inputs = work.context.to_map()
-    monkeypatch.setattr(Workspace, "mapped_from", lambda _: inputs)
+    inputs = work.context.current_model_inputs()
+    monkeypatch.setattr(Workspace, "model_inputs", lambda _: inputs)
     models = [ModelSummary(names, 9, 2.0, 0.5) for names in ((), EASY)]
     assert work.state.weights(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
 

@@ -20,7 +20,7 @@ from colmap_affrect.geometry.affine import (
     project,
     rectifying_affine,
 )
-from colmap_affrect.images.warping import halved, warp, warp_mask
+from colmap_affrect.images.warping import half_size, warp, warp_mask
 
 RAMP_ERROR_PX = 0.05
 """A plane fitted to a thousand samples or more with 8-bit rounding, at its corners."""
@@ -232,7 +232,7 @@ def test_warp_mask_is_zero_behind_the_camera() -> None:
 def test_halved_samples_at_pixel_centres(width: int, height: int) -> None:
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     for axis, ramp in enumerate((x, y)):
-        small = halved(ramp.astype(np.float32))
+        small = half_size(ramp.astype(np.float32))
         assert small.shape == (height // 2, width // 2)
         steps = np.arange(small.shape[1 - axis])
         along = (steps + 0.5) * (width, height)[axis] / len(steps) - 0.5

@@ -99,7 +99,7 @@ def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None
     before = write_run(folder, evidence=2.0 if case == "by chance" else 20.0,
                        wrong=2 if case == "contradiction" else 0)  # fmt: skip
     if case == "extends":
-        Workspace(folder).record_made_from(map="digest another-model")
+        Workspace(folder).record_input_digests(map="digest another-model")
     if case == "no run":
         (folder / "features.h5").unlink()
     said = list[str]()

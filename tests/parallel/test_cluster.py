@@ -311,7 +311,7 @@ def test_matches_of_other_weights_are_not_mixed(
 ) -> None:
     matched(tmp_path / "out", extracted, weights, Threads(1))
     workspace = Workspace(tmp_path / "out")
-    assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-aliked"]
+    assert list(workspace.record()["match"]["weights"]) == ["lightglue-aliked"]
     assert Context(workspace).matching == WITH_NETWORK.matching
     write_comparing_lightglue(tmp_path / "aliked_lightglue.pth")
     with pytest.raises(StoreError, match="match stage was run there with weights"):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from colmap_affrect.project.camera_notes import merge_shared_cameras
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
@@ -14,7 +15,6 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     StageReport,
-    as_mapped,
 )
 
 LARGE = ModelSummary(
@@ -215,7 +215,7 @@ def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:
         "            of those not known mapping makes 2: photographs of one size share"
         in text
     )
-    names = [camera["names"] for camera in as_mapped(cameras)]
+    names = [camera["names"] for camera in merge_shared_cameras(cameras)]
     assert names == [["a.png", "b.png"], ["c.png"], ["d.png"], ["e.png"]]
 
 

@@ -268,7 +268,7 @@ def test_learned_matches_kept_beside_those_in_use_stay_when_these_change(
 
     matches.write([found((0, 3), (2, 1))])
     learned = Learned(found((4, 7), level=2), (12, 0))
-    matches.keep_learned([learned])
+    matches.write_learned([learned])
     matches.write([], [names], 3, {names: (0, 5)})
     matches.write([found((1, 1), (3, 8), level=4)])
     (used,) = matches.read([names])
@@ -305,9 +305,9 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     pairs = (("a.png", "b.png"), ("a.png", "c.png"))
     matches.write([pair_matches(pair, [[0, 0]], 1) for pair in pairs])
     stationary = (((40, 30), ((1, 2), (3, 4))),)
-    matches.keep(stationary=stationary, effort="high", listed="digest")
+    matches.update_state(stationary=stationary, effort="high", listed="digest")
     learned_models = LearnedModels("digest", 2.5, is_sure=True, score_without=0.75)
-    matches.keep(
+    matches.update_state(
         step=Begun(1, pairs),
         has_stepped=True,
         learned_models=learned_models,
@@ -322,7 +322,7 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
 
 
 def test_state_that_is_none_is_damage(matches: MatchStore) -> None:
-    matches.keep(listed="digest")
+    matches.update_state(listed="digest")
     with h5py.File(matches.path, "a") as file:
         file.attrs["state"] = '{"step": {"level": "all"}}'
     with pytest.raises(StoreError, match=r"matches\.h5: damaged .*--overwrite"):

@@ -45,14 +45,14 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
     plan = {"match": {"max_ratio": 0.8}, "extract": {}}
     workspace.record_options("extract", OPTIONS, plan=plan, recipe="default")
     workspace.record_options("pairs", {"match_list_path": ""})
-    assert workspace.recorded() == {
+    assert workspace.record() == {
         "recipe": "default",
         "planned": {"match": {"max_ratio": 0.8}},
         "extract": {**OPTIONS, "sigmas": [8.0, 16.0]},
         "pairs": {"match_list_path": ""},
     }
     assert workspace.recipe() == "default"
-    assert workspace.planned("match") == {"max_ratio": 0.8}
+    assert workspace.options_on_record("match") == {"max_ratio": 0.8}
     with pytest.raises(OptionError, match="the match stage has not been run"):
         workspace.require("match")
     assert workspace.require("extract")["camera"] == {"mode": "auto"}
@@ -112,7 +112,7 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
     )
     left = sorted(path.name for path in finished.path.iterdir())
     assert left == sorted(["config.toml", *KEPT[stage]])
-    record = finished.recorded()
+    record = finished.record()
     earlier = STAGES[: STAGES.index(stage)]
     assert record.pop("recipe") == "default"
     # What was chosen for later stages is kept, unless everything begins anew.
@@ -122,7 +122,7 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
         **{name: {"by": name} for name in earlier},
         stage: {"by": "somebody else"},
     }
-    assert finished.begun == [*earlier, stage]
+    assert finished.started_stages == [*earlier, stage]
 
 
 def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
@@ -138,7 +138,7 @@ def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
     for stage in stages:
         copied.record_options(stage, {"by": stage})
     copied.database.write_bytes(b"copy")
-    assert copied.begun == stages
+    assert copied.started_stages == stages
     with pytest.raises(
         StoreError, match="the copy stage was run there, which extract cannot"
     ):
@@ -298,10 +298,10 @@ def test_branch_begins_after_the_raw_matches(
     names = ["cameras.json", "config.toml", "features.h5", "matches.h5", "pairs.txt"]
     assert sorted(path.name for path in branch.path.iterdir()) == names
     assert branch.features.read_bytes() == b"features.h5"
-    assert branch.begun == ["extract", "pairs", "match"]
-    record = branch.recorded()
+    assert branch.started_stages == ["extract", "pairs", "match"]
+    record = branch.record()
     assert {**record, **record["planned"]} == {
-        **finished.recorded(),
+        **finished.record(),
         "planned": record["planned"],
     }
     with pytest.raises(OptionError, match="the verify stage has not been run"):

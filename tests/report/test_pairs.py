@@ -24,9 +24,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
+from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
@@ -120,7 +120,7 @@ class Stores(SimpleNamespace):
         ]
         super().__init__(
             workspace=SimpleNamespace(
-                sparse=folder / "sparse", begun=begun, is_changed=False
+                sparse=folder / "sparse", started_stages=begun, is_changed=False
             ),
             extraction=SimpleNamespace(levels=levels),
             counts=num_keypoints(folder / "database.db"),

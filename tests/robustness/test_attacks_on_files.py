@@ -37,7 +37,7 @@ from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.images.reading import header_size, read_color, read_gray
 from colmap_affrect.matchers.base import MATCHERS, MatcherContext, Matches
 from colmap_affrect.pairs.lists import LONGEST_LINE, read_pairs
-from colmap_affrect.project.given_h5 import opened
+from colmap_affrect.project.given_h5 import open_given_file
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.workspace import Workspace
@@ -261,7 +261,7 @@ def test_array_that_was_never_written_is_not_read(tmp_path: Path) -> None:
     with h5py.File(path, "w") as file:
         file.create_dataset("a/keypoints", (100_000_000, 2), "f4", chunks=(4096, 2))
         file.create_dataset("b/keypoints", data=np.ones((5, 2)))
-    with opened(path) as given:
+    with open_given_file(path) as given:
         assert given.read("b/keypoints", (None, 2)).shape == (5, 2)
         with pytest.raises(AffrectError, match="was never written"):
             given.read("a/keypoints", (None, 2))
@@ -275,7 +275,7 @@ def test_groups_of_any_depth_are_one_line(tmp_path: Path) -> None:
         for _ in range(150):
             group = group.create_group("d")
         group["keypoints"] = np.ones((5, 2))
-    with pytest.raises(AffrectError, match="more than 100 deep"), opened(path):
+    with pytest.raises(AffrectError, match="more than 100 deep"), open_given_file(path):
         pass
 
 

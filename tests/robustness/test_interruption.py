@@ -180,7 +180,7 @@ def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
 def assert_readable(out: Path) -> None:
     """Every file that is there can be read as it lies there; an HDF5 file with its journal."""
     workspace = Workspace(out)
-    workspace.recorded()
+    workspace.record()
     for path in (workspace.features, workspace.matches):
         if path.exists() and not journal_of(path).exists():
             hdf5_content(path)

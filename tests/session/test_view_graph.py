@@ -32,12 +32,12 @@ def test_database_that_is_kept_open_is_opened_once_and_closed_in_the_end(
     tmp_path: Path, opened: Mock
 ) -> None:
     graph = ViewGraph(tmp_path / "database.db")
-    with graph.kept_open():
+    with graph.keep_open():
         for number, name in enumerate(("a.png", "b.png"), start=1):
-            with graph.opened() as database:
+            with graph.open_to_change() as database:
                 add_image(database, name)
             assert len(graph.ids) == len(graph.cameras) == number
-        with graph.reading() as database:
+        with graph.open_to_read() as database:
             assert database.num_images() == 2
         assert opened.call_count == 1
     assert not (tmp_path / "database.db-wal").exists()
@@ -50,9 +50,9 @@ def test_digest_is_of_what_was_written_while_the_database_is_kept_open(
 ) -> None:
     graph = ViewGraph(tmp_path / "database.db")
     digests = []
-    with graph.kept_open():
+    with graph.keep_open():
         for name in ("a.png", "b.png"):
-            with graph.opened() as database:
+            with graph.open_to_change() as database:
                 add_image(database, name)
             digests.append(graph.digest())
             assert graph.digest() == digests[-1]
@@ -66,11 +66,11 @@ def test_database_that_was_removed_or_replaced_meanwhile_is_opened_anew(
     other = tmp_path / "other.db"
     with open_database(other) as database:
         add_image(database, "other.png")
-    with graph.kept_open():
-        with graph.opened() as database:
+    with graph.keep_open():
+        with graph.open_to_change() as database:
             add_image(database, "a.png")
         graph.path.unlink()
-        with graph.opened() as database:
+        with graph.open_to_change() as database:
             assert database.num_images() == 0
             add_image(database, "b.png")
         assert graph.ids.keys() == {"b.png"}
@@ -83,12 +83,12 @@ def test_failure_of_the_database_is_one_line_and_it_is_opened_again(
     tmp_path: Path,
 ) -> None:
     graph = ViewGraph(tmp_path / "database.db")
-    with graph.kept_open():
-        with graph.opened() as database:
+    with graph.keep_open():
+        with graph.open_to_change() as database:
             add_image(database, "a.png")
         failing = Mock(side_effect=RuntimeError("disk I/O error"))
         refused = pytest.raises(AffrectError, match=r"database\.db: cannot be written")
-        with refused, graph.opened() as database:
+        with refused, graph.open_to_change() as database:
             add_image(database, "b.png")
             failing()
         assert graph.ids.keys() == {"a.png", "b.png"}

@@ -124,7 +124,7 @@ def test_captions_are_not_found_again(
     everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T
     sizes = set(context.features.image_sizes().values())
     cells = tuple(map(tuple, everywhere.tolist()))
-    context.matches.keep(stationary=tuple((size, cells) for size in sizes))
+    context.matches.update_state(stationary=tuple((size, cells) for size in sizes))
     assert guide(context, ALWAYS).num_done == 6
     assert guided_counts(context) == {}
 

@@ -111,7 +111,7 @@ def test_methods_and_a_list_are_joined(rooms: Workspace, call: Call) -> None:
     ]
     pairs = ["1.png 2.png", "1.png 3.png", "1.png 4.png", "2.png 3.png", "2.png 4.png"]
     assert choose(call, rooms, *given) == [*pairs, "3.png 4.png"]
-    assert rooms.recorded()["pairs"] == {
+    assert rooms.record()["pairs"] == {
         "match_list_path": str(listed), "methods": ["retrieval", "sequence"], "num_neighbors": 1,
         "max_distance_m": 100.0,
     }  # fmt: skip

@@ -115,8 +115,8 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     )
     assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
-    assert workspace.recorded().keys() == {"recipe", *stages, "made_from", "mapped"}
-    assert workspace.begun == stages
+    assert workspace.record().keys() == {"recipe", *stages, "made_from", "mapped"}
+    assert workspace.started_stages == stages
     lines = FeatureStore(workspace.features).lines(names[0])
     assert lines is not None
     assert report.lines.keys() == set(names)
@@ -179,9 +179,9 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
     assert hdf5_content(made.features) == hdf5_content(expected.features)
     assert hdf5_content(made.matches) == hdf5_content(expected.matches)
     assert made.pairs.read_bytes() == expected.pairs.read_bytes()
-    record = dict(made.recorded())
+    record = dict(made.record())
     planned = record.pop("planned")
-    assert record | planned == expected.recorded()
+    assert record | planned == expected.record()
     assert image_ids(made.database) == image_ids(expected.database)
     assert database_content(made.database) == database_content(expected.database)
     reports = [

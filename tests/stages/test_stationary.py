@@ -87,7 +87,9 @@ def test_pair_that_is_matched_later_is_filtered_by_what_is_known(
     features, matches, pairs = stores(tmp_path, scans(4))
     given = next(matches.read(pairs))
     StationaryFilter(features, matches).learn(pairs)
-    again = StationaryFilter(features, MatchStore(matches.path)).filtered(given)
+    again = StationaryFilter(features, MatchStore(matches.path)).without_stationary(
+        given
+    )
     assert len(again.indices) == len(SCENE)
 
 
@@ -105,8 +107,10 @@ def test_match_of_equal_letters_at_two_places_of_a_caption_is_left_out(
         :, 0
     ]  # from the scene to the caption and back
     again = StationaryFilter(features, MatchStore(matches.path))
-    assert len(again.filtered(replace(given, indices=swapped)).indices) == len(SCENE)
-    kept = again.filtered(to_caption).indices
+    assert len(
+        again.without_stationary(replace(given, indices=swapped)).indices
+    ) == len(SCENE)
+    kept = again.without_stationary(to_caption).indices
     assert len(kept) == len(SCENE) + len(CAPTION)
 
 
@@ -225,7 +229,7 @@ def test_what_stands_still_is_left_out_of_later_matches_anywhere(
     StationaryFilter(features, matches).learn(pairs)
     again = StationaryFilter(features, MatchStore(matches.path))
     for found in all_matched:
-        left = again.filtered(found).indices[:, 0]
+        left = again.without_stationary(found).indices[:, 0]
         assert left.max() < num
         assert len(left) > 0.9 * num
 

@@ -1,0 +1,112 @@
+"""What may be wrong of cameras by the model, as ``report.json`` has them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+MAX_LENSES = 3  # focal lengths in mm that a summary names
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A source of focal lengths that a model may contradict, and what to say then."""
+
+    what: str  # that may be wrong
+    sources: tuple[str, ...]  # of a focal length, as ``report.json`` calls them
+    by: str  # what its number is known by
+    remedy: str
+
+
+# What the user gives is usually held; that of a database only has a prior.
+CONTRADICTIONS = (
+    Contradiction(
+        what="EXIF",
+        sources=("exif", "exif-rescaled"),
+        by="by EXIF",
+        remedy="--ignore-exif leaves it out",
+    ),
+    Contradiction(
+        what="the given focal length",
+        sources=("given",),
+        by="given",
+        remedy="--cameras-path takes another one",
+    ),
+)
+# Of a focal length: three standard deviations of what EXIF usually has
+MAX_EXIF_ERROR = 1.27
+
+
+def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say where a model contradicts what was known of cameras, and what would tell lenses in mm.
+
+    Args:
+        cameras: entries of ``report.json``.
+    """
+    notes = []
+    for contradiction in CONTRADICTIONS:
+        notes += _contradiction_notes(cameras, contradiction)
+    estimated = list(filter(_is_estimated, cameras))
+    num_estimates = len({camera["refined_px"] for camera in estimated})
+    if num_estimates < len(estimated):
+        notes.append(
+            f"of those not known mapping makes {num_estimates}: photographs of one size share one"
+        )
+    lenses_mm = {camera.get("lens_mm") or 0.0 for camera in cameras}
+    known_mm = sorted(filter(None, lenses_mm))
+    if known_mm:
+        texts = ", ".join(f"{mm:g}" for mm in known_mm[:MAX_LENSES])
+        notes.append(
+            f"EXIF has {texts} mm, and not the size of the sensor: --focal-mm {known_mm[0]:g} "
+            "--film-width-mm WIDTH (its longer side) tells the focal length"
+        )
+    return notes
+
+
+def _contradiction_notes(
+    cameras: Sequence[Mapping[str, Any]], contradiction: Contradiction
+) -> list[str]:
+    """Return a line where models are far from the focal lengths of some sources."""
+    sources = contradiction.sources
+    wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
+    if not wrong:
+        return []
+    known_px = wrong[0]["focal_px"]
+    estimated_px = wrong[0]["refined_px"]
+    more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+    return [
+        f"{contradiction.what} may be wrong: {known_px:.0f} px {contradiction.by}, "
+        f"{estimated_px:.0f} px in the model{more}; {contradiction.remedy}"
+    ]
+
+
+def merge_shared_cameras(
+    cameras: Sequence[Mapping[str, Any]],
+) -> list[Mapping[str, Any]]:
+    """Return cameras, with those that mapping has made one as one, with all their photographs.
+
+    Args:
+        cameras: entries of ``report.json``.
+    """
+    merged: dict[object, Mapping[str, Any]] = {}
+    for number, camera in enumerate(cameras):
+        key: object = number
+        if _is_estimated(camera):
+            key = (camera["refined_px"], camera["focal_px"], camera["why"])
+        names = camera["names"]
+        if key in merged:
+            names = [*merged[key]["names"], *names]
+        merged[key] = {**camera, "names": names}
+    return list(merged.values())
+
+
+def _is_estimated(camera: Mapping[str, Any]) -> bool:
+    """Return whether nothing but the model tells the focal length of a camera."""
+    return camera["source"] == "guess" and bool(camera.get("refined_px"))
+
+
+def _is_contradicted(camera: Mapping[str, Any], sources: Sequence[str]) -> bool:
+    """Tell whether a model is far from a focal length that is known from one of some sources."""
+    if camera["source"] not in sources or not camera.get("refined_px"):
+        return False
+    ratio = camera["refined_px"] / camera["focal_px"]
+    return not 1 / MAX_EXIF_ERROR <= ratio <= MAX_EXIF_ERROR

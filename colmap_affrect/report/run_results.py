@@ -1,0 +1,112 @@
+"""What a run ends with: ``report.json`` and ``report.html``, from the models that mapping made."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from colmap_affrect.colmap.by_hand import Marks
+from colmap_affrect.colmap.database import num_matched_pairs
+from colmap_affrect.escalation.escalate import matched_again
+from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.report import (
+    ModelSummary,
+    StageReport,
+    installed_versions,
+    sum_by_stage,
+)
+from colmap_affrect.report.advice import advice
+from colmap_affrect.report.pairs import draw_pairs_to_check
+from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.report.run_report import (
+    RunReport,
+    cameras_of_report,
+    lines_of_report,
+)
+from colmap_affrect.session.context import Context
+from colmap_affrect.stages.guide import guided_counts
+from colmap_affrect.stages.map import unregistered
+
+
+@dataclass(frozen=True)
+class MappingResult:
+    """What mapping was given, and what it made."""
+
+    options: MapperOptions  # of the mapper
+    names: Sequence[str]  # of all photographs
+    extended: Sequence[str]  # photographs of the model that was extended, if any
+    marks: Marks  # tie points by hand
+    models: Sequence[ModelSummary]  # the largest first
+    stages: Sequence[StageReport]  # all of the run, in their order
+
+
+def write_results(context: Context, result: MappingResult, *, page: bool) -> RunReport:
+    """Write ``report.json`` and, if wanted, ``report.html``.
+
+    Args:
+        context: of the workspace, with its models.
+        result: of mapping.
+        page: also write ``report.html``.
+
+    Returns:
+        The report that is also written to ``report.json``.
+    """
+    workspace = context.workspace
+    verified = context.num_verified_inliers().items()
+    by_hand = context.by_hand
+    pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
+    missing = unregistered(context, result.names, result.models, pair_inliers)
+    again = matched_again(context)
+    report = RunReport(
+        output_path=workspace.path,
+        images_total=len(result.names),
+        unregistered=missing,
+        models=tuple(result.models),
+        num_verified_pairs=len(pair_inliers),
+        stages=sum_by_stage(result.stages),
+        versions=installed_versions(),
+        preset=result.options.preset_name,
+        verification=context.verification.to_mapping(),
+        mapping=result.options.to_mapping(),
+        cameras=cameras_of_report(workspace, result.models, result.extended),
+        extended=tuple(result.extended),
+        advice=advice(
+            context,
+            missing,
+            result.models,
+            max(pair_inliers.values(), default=0),
+            again.untried,
+            again.effort,
+        ),
+        by_hand=by_hand.texts(),
+        effort=again.effort if again.tried or again.untried else "",
+        matched_again=again.tried,
+        untried=again.untried,
+        **_own_results(context, result.names),
+    )
+    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
+    replace_text(workspace.report, report.to_json())
+    if page:
+        content = RunContent(
+            result.names,
+            pair_inliers,
+            workspace.photographs(),
+            result.marks,
+            draw_pairs_to_check(context, report, pair_inliers),
+            context.graph.cameras,
+        )
+        write_run_page(workspace, report, content, context.progress)
+    return report
+
+
+def _own_results(context: Context, names: Sequence[str]) -> dict[str, Any]:
+    """Return the fields that differ, or are missing, for the database of another program."""
+    workspace = context.workspace
+    if workspace.is_foreign:
+        return {"num_pairs": num_matched_pairs(workspace.database), "recipe": ""}
+    return {
+        "num_pairs": len(context.listed_pairs()),
+        "recipe": workspace.recipe(),
+        "guided": guided_counts(context),
+        "lines": lines_of_report(context.features, names),
+    }
