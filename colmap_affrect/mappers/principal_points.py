@@ -110,32 +110,7 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
 def with_shifted_axes(
     model: pycolmap.Reconstruction, free: Search, graph: PairGraph
 ) -> pycolmap.Reconstruction:
-    """Return the better of two models with free principal points: as it is, and from afar.
-
-    Args:
-        model: With held principal points; it stays as it is.
-        free: The search with free principal points.
-        graph: Pairs that the model is made from.
-    """
-    near = _restarted(model, free, graph, FINAL)
-    far = _from_afar(model, free, graph)
-    if points_score(far, free) > points_score(near, free):
-        return far
-    return near
-
-
-def points_score(model: pycolmap.Reconstruction, search: Search) -> float:
-    """Return the score of a model without the costs of principal points.
-
-    Where points have shown that principal points are not where they are held, these costs are paid.
-    """
-    return search.scorer.score(model) + _principal_point_cost(model, search)
-
-
-def _from_afar(
-    model: pycolmap.Reconstruction, free: Search, graph: PairGraph
-) -> pycolmap.Reconstruction:
-    """Return a model with free principal points, from a straight lens and by far errors.
+    """Return a model with free principal points.
 
     Args:
         model: With held principal points; it stays as it is.
@@ -163,7 +138,7 @@ def _from_afar(
     return _restarted(model=changed, search=free, graph=graph, iterations=FINAL)
 
 
-def _principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
+def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
     """Return how much the free principal points of a model cost, in nats."""
     total = 0.0
     for camera in {c.camera_id: c for c in cameras_of(model).values()}.values():

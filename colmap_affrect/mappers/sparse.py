@@ -20,7 +20,7 @@ from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     contradict_held,
-    points_score,
+    principal_point_cost,
     with_free_principal_points,
     with_shifted_axes,
 )
@@ -373,11 +373,11 @@ class _HypothesisTest:
         changed_model = replace(self.best[0], reconstruction=changed)
         found = free.with_bridges(search.graph, [changed_model])
         found = with_own_images([*found, *self.best[1:]])
-        score = points_score(found[0].reconstruction, free)
-        if score > self.score + MIN_SCORE_GAIN:
+        score = free.best_score(found[:1])
+        paid = principal_point_cost(found[0].reconstruction, free)  # by the points
+        if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
-            own_score = free.best_score(found[:1])
-            self._take(_Hypothesis(SHIFTED_AXES, ()), found, own_score)
+            self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
 
     def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""
