@@ -321,7 +321,9 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
-            self.matches.update_state(learned_matching=Begun(step.level, tuple(step.pairs)))
+            self.matches.update_state(
+                learned_matching=Begun(step.level, tuple(step.pairs))
+            )
         return bool(step.pairs)
 
     def match_learned(self) -> int:

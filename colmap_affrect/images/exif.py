@@ -20,14 +20,16 @@ FILM_DIAGONAL_MM = 43.27
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
 mm and micrometres."""
-# In longer sides: 118 to 10 degrees, which hold nearly all lenses
+# In longer sides: 118 to 10 degrees, which hold nearly all lenses; theory
 PLAUSIBLE_FOCALS = (0.3, 6.0)
-# Ratio of focal lengths that still agree: equivalents are rounded
+# Ratio of focal lengths that still agree: equivalents are rounded; theory
 MAX_CONTRADICTION = 1.15
-MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
-# Photographs of another shape may have been cropped
+MAX_ASPECT_ERROR = (
+    0.01  # lossless rotation cuts off up to 15 px, shrinking rounds; theory
+)
+# Photographs of another shape may have been cropped; theory
 SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
-# Longer side of the thumbnails of cameras, often with black bars
+# Longer side of the thumbnails of cameras, often with black bars; format
 MAX_THUMBNAIL_PX = 160
 RESOLUTION = "focal-plane resolution"
 EQUIVALENT = "35 mm equivalent"

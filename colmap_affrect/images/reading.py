@@ -37,13 +37,13 @@ from colmap_affrect.project.regular_files import (
     require_regular,
 )
 
-# Of a photograph; those of the largest cameras have 400 megapixels
+# Of a photograph; those of the largest cameras have 400 megapixels; damage
 MAX_NUM_PX = 1 << 29
-MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes
-USUAL_BYTES = 1 << 26
+MAX_NUM_BYTES = 12 * MAX_NUM_PX  # of its file: three channels of four bytes; damage
+USUAL_BYTES = 1 << 26  # Resource
 """Of a photograph, with all that cameras put beside its pixels, as short films; 64 MiB. Only longer
 files are compared with their pixels."""
-MAX_BYTES_PER_PX = 16  # four channels of four bytes
+MAX_BYTES_PER_PX = 16  # four channels of four bytes; format
 # Filters of warnings are of the process: threads would mix them up
 ONE_AT_A_TIME = Lock()
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -57,8 +57,8 @@ READERS = {
     PNM: PpmImageFile,
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
-NEW_SUBFILE_TYPE = 254  # TIFF's tag of what a page is
-REDUCED = 1  # its bit of a smaller copy of another page
+NEW_SUBFILE_TYPE = 254  # TIFF's tag of what a page is; format
+REDUCED = 1  # its bit of a smaller copy of another page; format
 
 Found = TypeVar("Found")
 
@@ -258,16 +258,16 @@ FOREIGN_FORMATS = {
     "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
 }
 """First bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's wheel not."""
-# Black and white of a stretched photograph but for dust and glints
+# Black and white of a stretched photograph but for dust and glints; judged
 TONE_PERCENTILES = (0.5, 99.5)
-# A photograph whose tones fill less of the range of its file is stretched
+# A photograph whose tones fill less of the range of its file is stretched; judged
 MIN_TONE_RANGE = 0.5
-# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+# Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise; judged
 MAX_TONE_STEP = 16
-# Of floats that are meant from 0 to 1: filters and highlights go beyond
+# Of floats that are meant from 0 to 1: filters and highlights go beyond; theory
 FLOAT_RANGE = (-0.5, 2.0)
-NUM_TONES = 250_000  # about so many pixels are looked at
-# Along each border is passed over: scans have frames and captions there
+NUM_TONES = 250_000  # about so many pixels are looked at; resource
+# Along each border is passed over: scans have frames and captions there; judged
 FRAME_FRAC = 0.1
 GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

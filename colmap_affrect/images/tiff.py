@@ -21,7 +21,7 @@ class TiffLayout:
 
 TIFF_LAYOUT = TiffLayout(where=4, offset="I", count="H", entry_bytes=12)
 BIG_TIFF_LAYOUT = TiffLayout(where=8, offset="Q", count="Q", entry_bytes=20)
-# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits
+# What files of more than 4 GiB have in the place of 42, with offsets of 64 bits; format
 BIG_TIFF = 43
 
 

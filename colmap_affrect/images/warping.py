@@ -12,12 +12,12 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.geometry.conventions import is_inside
 
-# Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
+# Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT); paper
 ANTI_ALIASING_SIGMA = 0.8
-TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression
+TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression; resource
 # Points along a side of a tile at which its compression is measured
 SAMPLES_PER_TILE = 5
-# Samples per px of a warp along an axis; beyond, memory counts more than aliasing
+# Samples per px of a warp along an axis; beyond, memory counts more than aliasing; resource
 MAX_DENSITY = 16
 
 

@@ -20,7 +20,7 @@ from typing import (
 
 from colmap_affrect.errors import OptionError
 
-MAX_SHOWN = 60  # characters of a value that is refused
+MAX_SHOWN = 60  # characters of a value that is refused; display
 # Numpy's scalars are such, too
 NUMBERS: Mapping[Any, type] = {float: Real, int: Integral}
 # Sequences of characters, which nobody means by a sequence of names

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-MAX_LENSES = 3  # focal lengths in mm that a summary names
+MAX_LENSES = 3  # focal lengths in mm that a summary names; display
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ CONTRADICTIONS = (
         remedy="--cameras-path takes another one",
     ),
 )
-# Of a focal length: three standard deviations of what EXIF usually has
+# Of a focal length: three standard deviations of what EXIF usually has; theory
 MAX_EXIF_ERROR = 1.27
 
 

@@ -35,11 +35,13 @@ MARKS = {
     "config.toml": b"format_version",
     "run.log": b"colmap-affrect",
 }
-LONGEST_NAME = 255  # bytes that file systems take
-# There has to be room for the longer names of what is beside it meanwhile
+LONGEST_NAME = 255  # bytes that file systems take; format
+# There has to be room for the longer names of what is beside it meanwhile; format
 MAX_NAME_BYTES = LONGEST_NAME - 35
-SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
-BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
+SPARE_BYTES = (
+    1 << 16
+)  # a disk with less room may have cut off what was written last; resource
+BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are; format
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
 
 

@@ -19,8 +19,8 @@ KINDS = {
     stat.S_IFBLK: "a device",
 }
 """What else may have the name of a file, by its type."""
-CHUNK_BYTES = 1 << 20  # of a file that are in memory while it is digested
-MAX_TEXT_BYTES = 1 << 30  # of lists, tables and options
+CHUNK_BYTES = 1 << 20  # of a file that are in memory while it is digested; resource
+MAX_TEXT_BYTES = 1 << 30  # of lists, tables and options; damage
 # Neither flag is on all systems
 NEVER_WAITS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 

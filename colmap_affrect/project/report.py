@@ -15,8 +15,8 @@ from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 
-NUM_WORST = 3  # tie points that a summary names
-MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
+NUM_WORST = 3  # tie points that a summary names; display
+MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all; display
 
 SOURCES = {  # how a summary calls where focal lengths are from; others by their own names
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size",
@@ -25,11 +25,11 @@ SOURCES = {  # how a summary calls where focal lengths are from; others by their
 
 OF_LARGEST = (  # what ``report.json`` has of the largest model under its own name
     "registered_names", "probabilities", "unsure", "doubtful", "mean_track_length",
-    "mean_reprojection_error_px", "moves", "one_view",
+    "mean_reprojection_error_px", "hypotheses", "one_view",
 )  # fmt: skip
 
-SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other
-MOST_CERTAIN = 0.999  # nothing is more probable than that
+SURE, DOUBTFUL = 0.9, 0.5  # probabilities: at least one, below the other; theory
+MOST_CERTAIN = 0.999  # nothing is more probable than that; theory
 
 
 def kept_probability(probability: float) -> float:
@@ -227,7 +227,7 @@ class ModelSummary:
     """Why images that were surely wrong were taken out."""
     focals_px: dict[str, float] = field(default_factory=dict)
     """Focal length of the camera of each image."""
-    moves: tuple[str, ...] = ()
+    hypotheses: tuple[str, ...] = ()
     """What made the model, by the sparse mapper."""
     tie_points: tuple[Residual, ...] = ()
     """Residuals of the tie points by hand, the worst first."""

@@ -74,7 +74,9 @@ def matched(
         photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
     )
     escalation, _ = begin(Context(workspace), recipe.escalate)
-    escalation.matches.update_state(learned_matching=Begun(1, tuple(escalation.state.pairs)))
+    escalation.matches.update_state(
+        learned_matching=Begun(1, tuple(escalation.state.pairs))
+    )
     assert escalation.match_learned() == len(escalation.state.pairs)
     return workspace
 
