@@ -164,14 +164,14 @@ def significance(
         hits = model.errors(*random_matches(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
         alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
-        first = _telling_shapes(keypoints[0])
-        second = _telling_shapes(keypoints[1])
+        first = telling_shapes(keypoints[0])
+        second = telling_shapes(keypoints[1])
         if math.isinf(alarms) or first is None or second is None:
             return -alarms
         return _frame_evidence(model, inliers, (first, second)) - alarms
 
 
-def _telling_shapes(keypoints: Floats) -> Array | None:
+def telling_shapes(keypoints: Floats) -> Array | None:
     """Return the (N, 2, 2) shapes of keypoints of 4 or 6 columns, up to a factor.
 
     None without any, if all are alike, or only views differ.

@@ -18,6 +18,7 @@ from colmap_affrect.geometry.segments import Segments
 
 CHANCE_DENSITY = (
     2.0 / math.pi
+<<<<<<< HEAD
 )  # of the angle of a segment that is there by chance, per rad; theory
 CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand; judged
 # Segments of each direction that are reckoned with beforehand; theory
@@ -27,6 +28,17 @@ MAX_STEP = 0.1  # rad, of a step of refinement; numeric
 DAMPING = 1e-6  # of it, relative to what is known of the turn; numeric
 TINY = 1e-12  # numeric
 CHANCE = -1  # kind of a segment that belongs to no direction; format
+=======
+)  # of the angle of a segment that is there by chance, per rad
+CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
+DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
+NUM_EM_STEPS = 3  # for the shares of the directions and of chance
+MAX_STEP = 0.1  # rad, of a step of refinement
+DAMPING = 1e-6  # of it, relative to what is known of the turn
+TINY = 1e-12
+NUM_AT_ONCE = 80  # cameras; the arrays of more of them do not stay in the cache
+CHANCE = -1  # kind of a segment that belongs to no direction
+>>>>>>> speed59
 
 
 class VanishingFit:
@@ -54,11 +66,16 @@ class VanishingFit:
         self.distances = self._distances(
             points
         )  # (K, 3, N) from middles to vanishing points
-        self.sines = self._crossed(points) / self.distances  # of the angles to these
+        self.sines = self._crossed(points)  # of the angles to these
+        self.sines /= self.distances
         sigmas = segments.sigmas
         densities = np.empty((len(focals), 4, len(segments)))
-        densities[:, :3] = np.exp(-0.5 * (self.sines / sigmas) ** 2)
-        densities[:, :3] *= math.sqrt(2.0 / math.pi) / sigmas
+        of_directions = densities[:, :3]
+        np.divide(self.sines, sigmas, out=of_directions)
+        np.square(of_directions, out=of_directions)
+        of_directions *= -0.5
+        np.exp(of_directions, out=of_directions)
+        of_directions *= math.sqrt(2.0 / math.pi) / sigmas
         densities[:, 3] = CHANCE_DENSITY
         self.densities = densities  # (K, 4, N) of the three directions and of chance
         self.shares = self._estimated_shares()
@@ -73,9 +90,17 @@ class VanishingFit:
     def _distances(self, points: Floats) -> Floats:
         """Return the (K, 3, N) lengths of the vectors from middles to homogeneous points."""
         middles = self.segments.middles
-        across = points[..., :1] - points[..., 2:] * middles[:, 0]
-        down = points[..., 1:2] - points[..., 2:] * middles[:, 1]
-        return np.asarray(np.sqrt(across * across + down * down) + TINY)
+        across = points[..., 2:] * middles[:, 0]
+        np.subtract(points[..., :1], across, out=across)
+        down = points[..., 2:] * middles[:, 1]
+        np.subtract(points[..., 1:2], down, out=down)
+        # In place: making and leaving large arrays takes longer than the sums.
+        across *= across
+        down *= down
+        across += down
+        np.sqrt(across, out=across)
+        across += TINY
+        return np.asarray(across)
 
     def _crossed(self, points: Floats) -> Floats:
         """Return the (K, 3, N) cross products of these vectors with the directions of segments."""
@@ -114,10 +139,9 @@ class VanishingFit:
         num_cameras = len(self.focals)
         slopes = np.empty((num_cameras, 3, *self.sines.shape[1:]))
         for axis in range(3):
-            turned = np.cross(np.eye(3)[axis], self.rotations)
-            slopes[:, axis] = (
-                self._crossed(self._vanishing_points(turned)) / self.distances
-            )
+            turned = _turning(self.rotations, axis)
+            crossed = self._crossed(self._vanishing_points(turned))
+            np.divide(crossed, self.distances, out=slopes[:, axis])
         weighted = (slopes * parts[:, None]).reshape(num_cameras, 3, -1)
         slopes = slopes.reshape(num_cameras, 3, -1)
         normal = weighted @ np.swapaxes(slopes, 1, 2)
@@ -146,7 +170,7 @@ def refined(
 
     Args:
         segments: of the photograph.
-        rotations: (K, 3, 3), rows are directions in the camera's frame.
+        rotations: (K, 3, 3), rows are the three directions in the camera's frame.
         focals: (K,) focal lengths, longer sides.
         shifts: (K,) shifts of the principal point, longer sides.
         num_steps: of Gauss-Newton; those that explain less are passed over.
@@ -154,6 +178,24 @@ def refined(
     Returns:
         (K, 3, 3) rotations, and (K,) log-likelihood ratios against chance alone.
     """
+    best = np.empty_like(rotations)
+    scores = np.empty(len(rotations))
+    for begin in range(0, len(rotations), NUM_AT_ONCE):
+        part = slice(begin, begin + NUM_AT_ONCE)
+        best[part], scores[part] = _refined_at_once(
+            segments, rotations[part], focals[part], shifts[part], num_steps
+        )
+    return best, scores
+
+
+def _refined_at_once(
+    segments: Segments,
+    rotations: Floats,
+    focals: Floats,
+    shifts: Floats,
+    num_steps: int,
+) -> tuple[Floats, Floats]:
+    """Do what :func:`refined` does, for all cameras together."""
     best = rotations
     fit = VanishingFit(segments, rotations, focals, shifts)
     scores = fit.scores()
@@ -164,6 +206,16 @@ def refined(
         best = np.where(is_better[:, None, None], fit.rotations, best)
         scores = np.where(is_better, found, scores)
     return best, scores
+
+
+def _turning(rotations: Floats, axis: int) -> Floats:
+    """Return how (K, 3, 3) rows change when they begin to turn about an axis of the camera."""
+    change = np.zeros_like(rotations)
+    second = (axis + 1) % 3
+    third = (axis + 2) % 3
+    change[..., second] = -rotations[..., third]
+    change[..., third] = rotations[..., second]
+    return change
 
 
 def _turned(rotations: Floats, steps: Floats) -> Floats:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from colmap_affrect.errors import OptionError, PartError
-from colmap_affrect.features.weights import digests, resolve
+from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.matchers.base import (
@@ -155,7 +155,8 @@ def load_matchers(
 ) -> dict[str, Path]:
     """Return the files of weights that the matchers of all levels read, by key.
 
-    Their networks are built once before matching begins: AffrectError for what cannot be used.
+    AffrectError for what cannot be used: before matching begins, networks are built once by files
+    that are not the published ones.
     """
     resources = context.resources
     matchers = extraction.matchers(options)
@@ -165,8 +166,14 @@ def load_matchers(
     weights = resolve(sorted(keys), resources.weights_path)
     if "match" not in context.workspace.started_stages:
         for matcher in learned:
-            MATCHERS.make(matcher, MatcherContext(weights, "cpu"))
+            if not _are_published({key: weights[key] for key in matcher.weights}):
+                MATCHERS.make(matcher, MatcherContext(weights, "cpu"))
     return weights
+
+
+def _are_published(files: Mapping[str, Path]) -> bool:
+    """Tell whether files of weights are the published ones, which their networks take."""
+    return all(is_published(key, path) for key, path in files.items())
 
 
 def match_pairs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -38,3 +39,20 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
     assert "| unrectified-rootsift | " in text
     given = [*photos, "--num-images", 1, "--methods", "rectified"]
     assert "| rectified | " in run_script("tests/benchmarks/complexity.py", *given)
+
+
+@pytest.mark.long
+def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = tmp_path / "whole.json"
+    diagram = tmp_path / "whole.png"
+    given = ["--scenes-path", "sample_scenes", "--sets", "courtyard:3"]
+    given += ["--peers", "sift-colmap", "rectified", "--num-rounds", "1"]
+    written = ["--output-path", result, "--diagram-path", diagram]
+    text = run_script("tests/benchmarks/whole_run.py", *given, *written)
+    runs = json.loads(result.read_text())["runs"]
+    assert [run["correct"] for run in runs] == [0, 3]
+    for run in runs:
+        assert 0.0 < sum(run["stages_s"].values()) < run["wall_s"]
+    assert "| courtyard:3 | 3 | rectified | " in text
+    assert diagram.read_bytes().startswith(b"\x89PNG")

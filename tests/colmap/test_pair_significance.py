@@ -302,3 +302,56 @@ def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
             (sides[0], sides[1]), matches, VerificationOptions(min_significance=0.0)
         )
         assert len(accepted.inlier_matches) >= 40
+
+
+def trials_for(
+    frames: Frames, monkeypatch: pytest.MonkeyPatch, columns: int = 6, **options: float
+) -> int:
+    """Most trials that COLMAP is asked for to verify a pair."""
+    asked = list[int]()
+
+    def without_trials(*given: object) -> pycolmap.TwoViewGeometry:
+        search = given[-1]
+        assert isinstance(search, pycolmap.TwoViewGeometryOptions)
+        asked.append(search.ransac.max_num_trials)
+        return pycolmap.TwoViewGeometry()
+
+    monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", without_trials)
+    num_inliers(frames, columns, **options)
+    (num_trials,) = asked
+    return num_trials
+
+
+def some_right_matches(num: int, num_wrong: int, seed: int = 0) -> Frames:
+    """Frames of a few right matches of one plane, and of wrong ones."""
+    first, second = frames_of([HOMOGRAPHY], num, seed + 1)
+    other1, other2 = frames_of([HOMOGRAPHY], num_wrong, seed + 2)
+    random = np.random.default_rng(seed + 3)
+    other2[:, :, 2] = random.uniform((0, 0), SIZE, (num_wrong, 2))
+    other2[:, :, :2] = (
+        rotation(random.uniform(0, 2 * np.pi, num_wrong)) @ (other2[:, :, :2])
+    )
+    return np.concatenate([first, other1]), np.concatenate([second, other2])
+
+
+def test_pairs_without_anything_in_common_are_not_searched_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usual = VerificationOptions().max_num_trials
+    for seed in range(0, 30, 10):
+        nothing = some_right_matches(0, 70, seed)
+        assert trials_for(nothing, monkeypatch) == usual // 10
+        something = some_right_matches(20, 50, seed)
+        assert trials_for(something, monkeypatch) == usual
+
+
+def test_the_search_is_as_long_as_asked_where_neighbours_say_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usual = VerificationOptions().max_num_trials
+    nothing = some_right_matches(0, 70)
+    assert trials_for(nothing, monkeypatch, columns=2) == usual
+    assert trials_for(nothing, monkeypatch, min_significance=0.0) == usual
+    assert trials_for(nothing, monkeypatch, max_num_trials=50) == 50
+    assert trials_for(some_right_matches(0, 310), monkeypatch) == usual
+    assert trials_for(some_right_matches(0, 290), monkeypatch) == usual // 10

@@ -13,16 +13,24 @@ from small_scene import NAMES as PHOTOGRAPHS
 from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.matchers.lightglue import LightGlueOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs
+from colmap_affrect.project.record import file_sha256
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages import match as stage
 from colmap_affrect.stages.match import (
     MANY_MATCHES,
     CachedMatcher,
     Matching,
     iterate_matches,
+    load_matchers,
     not_well_tied,
 )
 
@@ -171,3 +179,19 @@ def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
         store = MatchStore(out / "matches.h5")
         assert bool(store.nums_of_some(exhaustive_pairs(PHOTOGRAPHS))) == are_left
         monkeypatch.setattr(stage, "MIN_GROWTH", 0.0)
+
+
+def test_only_networks_of_files_that_are_not_the_published_ones_are_built_beforehand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    published = WEIGHT_FILES["lightglue-aliked"]
+    path = tmp_path / published.file_name
+    path.write_bytes(b"no network")
+    context = Context(Workspace(tmp_path / "out"), Resources(weights_path=tmp_path))
+    extraction = load_recipe("aliked-lightglue").extraction
+    with pytest.raises(AffrectError, match="not a file of weights"):
+        load_matchers(context, extraction, LightGlueOptions())
+    as_published = replace(published, sha256=file_sha256(path))
+    monkeypatch.setitem(WEIGHT_FILES, "lightglue-aliked", as_published)
+    found = load_matchers(context, extraction, LightGlueOptions())
+    assert found == {"lightglue-aliked": path}
