@@ -108,7 +108,7 @@ class _Images:
         params = np.frombuffer(camera.params or b"", "<f8")
         if native is None or len(params) != len(native.params):
             return _Image(points, None, longer_side)
-        native.params = params
+        native.params = params.tolist()
         return _Image(points, native, longer_side)
 
 
