@@ -13,7 +13,14 @@ from typing import Annotated, Literal
 import numpy as np
 
 from colmap_affrect.data import Mask
-from colmap_affrect.errors import ImageError, OptionError, StoreError, one_line, such_as
+from colmap_affrect.errors import (
+    ImageError,
+    OptionError,
+    StoreError,
+    not_utf_8,
+    one_line,
+    such_as,
+)
 from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
@@ -364,7 +371,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
             f"{image_list_path}: cannot be read ({error.strerror})"
         ) from error
     except UnicodeDecodeError as error:
-        raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
+        raise OptionError(not_utf_8(image_list_path)) from error
     listed = []
     for line in dict.fromkeys(lines):
         if _is_below(image_path, line):  # a name may begin with a space or #
