@@ -18,7 +18,12 @@ from colmap_affrect.errors import (
     such_as,
 )
 from colmap_affrect.features.weights import digests
-from colmap_affrect.images.photographs import checked_names, left_out, not_named
+from colmap_affrect.images.photographs import (
+    checked_names,
+    left_out,
+    not_named,
+    require_folder,
+)
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.paths import PathLike
@@ -96,6 +101,8 @@ def extract(
         )
     _log_warnings(warnings)
     failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
+    if failures:
+        require_folder(folder)  # else it has gone with all that was still to come
     if len(failures) == len(names):
         why = f"none of the {len(names)} images can be used; the first: {failures[names[0]]}"
         raise ImageError(f"{folder}: {why}")
