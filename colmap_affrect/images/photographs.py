@@ -330,7 +330,7 @@ class _Walk:
         name = entry.name
         if name.startswith("."):
             return
-        if not entry.is_dir():
+        if not _is_folder(entry):
             if _suffix(name) in self.suffixes:
                 self.found.append(below + name)
         elif name in FOLDERS_OF_SYSTEMS:
@@ -338,6 +338,14 @@ class _Walk:
         elif not is_output_folder(self.folder / below / name):
             among = self.linked if entry.is_symlink() else self.ahead
             among.append(self.folder / below / name)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Tell whether an entry is a folder; who reads it says what else is wrong with it."""
+    try:
+        return entry.is_dir()
+    except OSError:  # a link that leads in a circle, for one
+        return False
 
 
 def _identity(path: Path) -> tuple[int, int]:
