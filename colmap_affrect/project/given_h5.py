@@ -77,8 +77,8 @@ def _require_filters(path: Path, dataset: h5py.Dataset) -> None:
         code = properties.get_filter(index)[0]
         if not h5py.h5z.filter_avail(code):
             raise StoreError(
-                f"{path}: {dataset.name[1:]} is compressed by a plugin of HDF5 that is not installed "
-                f"(filter {code}); write the file again with gzip, or without compression"
+                f"{path}: {dataset.name[1:]} is compressed by a plugin of HDF5 that is not "
+                f"installed (filter {code}); write the file again with gzip, or without compression"
             )
 
 
