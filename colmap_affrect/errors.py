@@ -201,6 +201,11 @@ def _escaped(character: str) -> str:
     return "".join(f"\\u{units[k : k + 2].hex()}" for k in range(0, len(units), 2))
 
 
+def not_utf_8(what: Path | str) -> str:
+    """Return what is said of a text in another encoding, as editors and shells write some."""
+    return f"{what}: is no text in UTF-8; save it as UTF-8"
+
+
 def one_line(text: str) -> str:
     """Return the same in one line, line ends as JSON has them."""
     return shown(text).replace("\n", _escaped("\n"))

@@ -262,7 +262,12 @@ def read_marks(
         name = meant[0]
         mark = _read_mark(place, row)
         require_inside(place, mark, name, size_of(name))
-        marks[point][name] = mark
+        before = marks[point].setdefault(name, mark)
+        if not np.array_equal(before, mark):
+            raise OptionError(
+                f"{place}: {point} is at {before[0]:g}, {before[1]:g} of {name} already; "
+                "leave one of both out"
+            )
     if max(map(len, marks.values()), default=0) < 2:
         raise OptionError(f"{where}: no point is marked in two photographs")
     return marks

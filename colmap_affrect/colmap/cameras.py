@@ -123,7 +123,8 @@ def _split(text: object) -> object:
 
 
 MOST = 1e7  # px, or mm: nothing can be computed with cameras of larger numbers; damage
-Positive = Annotated[float, pydantic.Field(gt=0.0, le=MOST, allow_inf_nan=False)]
+LEAST = 1e-3  # px, or mm: no image of a photograph is so small; damage
+Positive = Annotated[float, pydantic.Field(ge=LEAST, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, pydantic.Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 
 
@@ -183,9 +184,9 @@ class GivenCamera(Options):
                 f"{len(self.params)}"
             )
         focals_px = [self.params[index] for index in like.focal_length_idxs()]
-        if min(focals_px) <= 0.0:
+        if min(focals_px) < LEAST:
             raise ValueError(
-                f"params: a focal length of {self.params[0]:g} px cannot be"
+                f"params: a focal length of {min(focals_px):g} px cannot be"
             )
 
 

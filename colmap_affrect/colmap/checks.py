@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap.links import check_links
 from colmap_affrect.colmap.model_files import MAX_SIDE_PX, camera_like
+from colmap_affrect.colmap.moved_keypoints import images_with_moved_keypoints
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     MAX_NUM_IMAGES,
@@ -50,7 +51,7 @@ FATAL = FATAL_FOR_IMAGES | USELESS_KEYPOINTS | {
     "keypoint-data", "descriptor-data", "match-data", "matrix-data",
 }  # fmt: skip
 """The same of keypoints and matches."""
-WARNED = frozenset({"keypoints-in-a-corner"})
+WARNED = frozenset({"keypoints-in-a-corner", "keypoints-moved"})
 """Problems that results may be right in spite of."""
 FATAL_AS_IT_IS = FATAL | {"no-frame"}
 """The same for a database that is mapped without a copy, which would get frames."""
@@ -129,6 +130,9 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             _check_keypoints(connection, tables, found)
             _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
+            if FATAL.isdisjoint(found):  # else there may be no such rows
+                moved = images_with_moved_keypoints(connection, tables)
+                found.update({"keypoints-moved": moved} if moved else {})
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)

@@ -106,29 +106,43 @@ def _rotation_ratios(
     rays1 = _rays(points1 / focals1[:, None, None])  # (L, N, 3)
     rays2 = _rays(points2 / focals2[:, None, None])
     columns1 = np.ascontiguousarray(np.swapaxes(rays1, -1, -2))
-
-    def errors_of(rotations: Array) -> Array:
-        """Return (L, S, N) px for (L, S, 3, 3) rotations."""
-        # One product is ten times as fast as many
-        rows = rotations.reshape(len(lenses), -1, 3)
-        rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
-        depths = np.maximum(rotated[..., 2, :], MIN_DEPTH)
-        scales = focals2[:, None, None] / depths
-        errors_x = rotated[..., 0, :] * scales - points2[:, 0]
-        errors_y = rotated[..., 1, :] * scales - points2[:, 1]
-        return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
-
     random = np.random.default_rng(0)
     samples = random.integers(len(points1), size=(NUM_STARTS, 2))
-    start_errors = errors_of(_fitted_rotations(rays1[:, samples], rays2[:, samples]))
-    best_starts = np.median(start_errors, axis=2).argmin(axis=1)
-    errors = start_errors[np.arange(len(lenses)), best_starts]
+    starts = _fitted_rotations(rays1[:, samples], rays2[:, samples])
+    errors = np.empty(rays1.shape[:2])
+    # Lens by lens: what stays in the cache of a core is four times as fast.
+    for index, focal2 in enumerate(focals2):
+        start_errors = _rotation_errors(starts[index], columns1[index], points2, focal2)
+        best_start = np.median(start_errors, axis=1).argmin()
+        errors[index] = start_errors[best_start]
     for _ in range(MAX_ITERATIONS):
         limits = np.maximum(error, np.median(errors, axis=1))
         is_inlier = errors <= limits[:, None]
         rotations = _fitted_rotations(rays1 * is_inlier[..., None], rays2)
-        errors = errors_of(rotations[:, None])[:, 0]
+        for index, focal2 in enumerate(focals2):
+            rotation = rotations[index, None]
+            columns = columns1[index]
+            errors[index] = _rotation_errors(rotation, columns, points2, focal2)[0]
     return np.asarray((errors <= error).mean(axis=1))
+
+
+def _rotation_errors(
+    rotations: Array, columns1: Array, points2: Array, focal2: float
+) -> Array:
+    """Return (S, N) px between rotated rays and their matches, for one lens.
+
+    Args:
+        rotations: (S, 3, 3).
+        columns1: (3, N) unit rays of the first image.
+        points2: (N, 2) px from the middle of the second image.
+        focal2: Focal length of the second image in px.
+    """
+    rows = rotations.reshape(-1, 3)  # one product is ten times as fast as many
+    rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
+    scales = focal2 / np.maximum(rotated[:, 2], MIN_DEPTH)
+    errors_x = rotated[:, 0] * scales - points2[:, 0]
+    errors_y = rotated[:, 1] * scales - points2[:, 1]
+    return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
 
 
 def _fitted_rotations(rays1: Array, rays2: Array) -> Array:

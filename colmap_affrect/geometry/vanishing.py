@@ -16,10 +16,8 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.segments import Segments
 
-CHANCE_DENSITY = (
-    2.0 / math.pi
-<<<<<<< HEAD
-)  # of the angle of a segment that is there by chance, per rad; theory
+# Of the angle of a segment that is there by chance, per rad; theory
+CHANCE_DENSITY = 2.0 / math.pi
 CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand; judged
 # Segments of each direction that are reckoned with beforehand; theory
 DIRECTION_COUNT = 1.0
@@ -27,18 +25,9 @@ NUM_EM_STEPS = 3  # for the shares of the directions and of chance; resource
 MAX_STEP = 0.1  # rad, of a step of refinement; numeric
 DAMPING = 1e-6  # of it, relative to what is known of the turn; numeric
 TINY = 1e-12  # numeric
+# Cameras; the arrays of more of them do not stay in the cache; resource
+NUM_AT_ONCE = 80
 CHANCE = -1  # kind of a segment that belongs to no direction; format
-=======
-)  # of the angle of a segment that is there by chance, per rad
-CHANCE_COUNT = 4.0  # segments by chance that are reckoned with beforehand
-DIRECTION_COUNT = 1.0  # segments of each direction that are reckoned with beforehand
-NUM_EM_STEPS = 3  # for the shares of the directions and of chance
-MAX_STEP = 0.1  # rad, of a step of refinement
-DAMPING = 1e-6  # of it, relative to what is known of the turn
-TINY = 1e-12
-NUM_AT_ONCE = 80  # cameras; the arrays of more of them do not stay in the cache
-CHANCE = -1  # kind of a segment that belongs to no direction
->>>>>>> speed59
 
 
 class VanishingFit:

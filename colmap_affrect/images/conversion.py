@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, UnidentifiedImageError
 
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError, OptionError, WorkspaceError
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import (
@@ -82,8 +82,9 @@ def convert_images(
         What became of each file.
 
     Raises:
-        ImageError: there are no photographs.
-        OptionError: their folder is not there, or the new one is there already or inside it.
+        ImageError: none of the photographs can be decoded.
+        OptionError: there are none, their folder is not there, or the new one is there
+            already or inside it.
         WorkspaceError: the new folder cannot be written.
     """
     image_path = as_path(image_path, "image_path")
@@ -101,13 +102,20 @@ def convert_images(
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
     ):
+        folder.mkdir()
         conversion = _Conversion(
             image_path=image_path, folder=folder, output_path=output_path, names=names
         )
         for name in names:
             conversion.add(name)
             advance(1)
-    return conversion.report
+        report = conversion.report
+        if not (report.written or report.copied):
+            raise ImageError(
+                f"{image_path}: none of {len(names)} files can be converted; the first: "
+                f"{report.failures[names[0]]}"
+            )
+    return report
 
 
 class _Conversion:
@@ -165,6 +173,11 @@ class _Conversion:
             if not is_copy and new in self._of_copies:
                 continue
             target = self.folder / new
+            if not self.folder.is_dir():  # else only what comes now would be there
+                raise WorkspaceError(
+                    f"{self.output_path}: what was made for it has been removed meanwhile; "
+                    "run the same command again"
+                )
             try:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("xb") as file:

@@ -13,7 +13,14 @@ from typing import Annotated, Literal
 import numpy as np
 
 from colmap_affrect.data import Mask
-from colmap_affrect.errors import ImageError, OptionError, StoreError, one_line, such_as
+from colmap_affrect.errors import (
+    ImageError,
+    OptionError,
+    StoreError,
+    not_utf_8,
+    one_line,
+    such_as,
+)
 from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
@@ -337,7 +344,7 @@ class _Walk:
         name = entry.name
         if name.startswith("."):
             return
-        if not entry.is_dir():
+        if not _is_folder(entry):
             if _suffix(name) in self.suffixes:
                 self.found.append(below + name)
         elif name in FOLDERS_OF_SYSTEMS:
@@ -345,6 +352,14 @@ class _Walk:
         elif not is_output_folder(self.folder / below / name):
             among = self.linked if entry.is_symlink() else self.ahead
             among.append(self.folder / below / name)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Tell whether an entry is a folder; who reads it says what else is wrong with it."""
+    try:
+        return entry.is_dir()
+    except OSError:  # a link that leads in a circle, for one
+        return False
 
 
 def _identity(path: Path) -> tuple[int, int]:
@@ -378,7 +393,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
             f"{image_list_path}: cannot be read ({error.strerror})"
         ) from error
     except UnicodeDecodeError as error:
-        raise OptionError(f"{image_list_path}: cannot be read ({error})") from error
+        raise OptionError(not_utf_8(image_list_path)) from error
     listed = []
     for line in dict.fromkeys(lines):
         if _is_below(image_path, line):  # a name may begin with a space or #

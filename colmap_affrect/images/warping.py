@@ -14,7 +14,8 @@ from colmap_affrect.geometry.conventions import is_inside
 
 # Px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT); paper
 ANTI_ALIASING_SIGMA = 0.8
-TILE_PX = 64  # of the square tiles of homographies, each blurred for its strongest compression; resource
+# Of the square tiles of homographies, each blurred for its strongest compression; resource
+TILE_PX = 64
 # Points along a side of a tile at which its compression is measured
 SAMPLES_PER_TILE = 5
 # Samples per px of a warp along an axis; beyond, memory counts more than aliasing; resource

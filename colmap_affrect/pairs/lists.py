@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, clipped, not_utf_8
 from colmap_affrect.geometry.arrays import Bools, Indices
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
@@ -27,6 +27,7 @@ SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+
 MAX_SUGGESTIONS = 8
 # Characters: systems have no longer paths than half of it; format
 LONGEST_LINE = 1 << 13
+MAX_SHOWN = 200  # characters of a line that an error shows; display
 AT_ONCE = 1 << 16  # pairs that are given names together; resource
 # With 13,000 features each, while pairs are gone through; resource
 USUAL_IMAGES_IN_MEMORY = 40
@@ -223,14 +224,14 @@ def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Ind
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise OptionError(f"{path}: cannot be read ({error})") from error
+        raise OptionError(not_utf_8(path)) from error
     if problems:
         (line_number, line) = problems[0]
         more = len(problems) - 1
         others = f", nor are {more} more lines" if more else ""
         raise OptionError(
-            f"{path}: line {line_number}: {line!r} is not two names of images"
-            f"{_suggestion(line, names)}{others}"
+            f"{path}: line {line_number}: {clipped(repr(line), MAX_SHOWN)} is not two names of "
+            f"images{_suggestion(line, names)}{others}"
         )
     return found
 

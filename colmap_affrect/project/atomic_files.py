@@ -120,9 +120,15 @@ def require_space(path: Path, num_bytes: int, named: Path | None = None) -> None
 
 def cannot_write(path: Path, error: Exception) -> WorkspaceError:
     """Return the error that says which file could not be written and what to do."""
+    final = _final(path)
+    may_be_gone = isinstance(error, FileNotFoundError) or not isinstance(error, OSError)
+    if may_be_gone and not os.path.exists(final.parent):  # noqa: PTH110 - never fails
+        return WorkspaceError(
+            f"{final}: cannot be written, its folder is gone; run the same command again"
+        )
     reason = getattr(error, "strerror", None) or error
     return WorkspaceError(
-        f"{_final(path)}: cannot be written ({reason}); free space on the disk, or permit writing, "
+        f"{final}: cannot be written ({reason}); free space on the disk, or permit writing, "
         "and run the same command again: what was done before is kept"
     )
 

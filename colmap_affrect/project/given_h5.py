@@ -80,7 +80,20 @@ class GivenFile:
                 )
             if self.file[key].dtype.kind not in kinds:
                 raise ValueError(f"{key} does not hold numbers, or no whole ones")
+            _require_filters(self.path, self.file[key])
             return np.asarray(self.file[key][()])
+
+
+def _require_filters(path: Path, dataset: h5py.Dataset) -> None:
+    """Refuse an array that is compressed by what HDF5 lacks here; StoreError."""
+    properties = dataset.id.get_create_plist()
+    for index in range(properties.get_nfilters()):
+        code = properties.get_filter(index)[0]
+        if not h5py.h5z.filter_avail(code):
+            raise StoreError(
+                f"{path}: {dataset.name[1:]} is compressed by a plugin of HDF5 that is not "
+                f"installed (filter {code}); write the file again with gzip, or without compression"
+            )
 
 
 @contextmanager

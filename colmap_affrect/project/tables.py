@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, not_utf_8
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.regular_files import read_regular_text
 
@@ -82,7 +82,9 @@ def _read_lines(path: Path, where: str) -> list[tuple[int, list[str]]]:
             cells = [cell.strip() for cell in row]
             if any(cells):
                 lines.append((reader.line_num, cells))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise OptionError(not_utf_8(where)) from error
+    except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise OptionError(f"{where}: cannot be read ({reason})") from error
     return lines
@@ -99,7 +101,7 @@ def _check_header(
     for column in header:
         if column not in columns:
             raise OptionError(
-                f"{where}: unknown column '{column}'{suggestion(column, columns)}"
+                f"{where}: unknown column '{column}'{suggestion(column, sorted(columns))}"
             )
     if (key and key not in header) or len(set(header)) < len(header):
         must = key or columns[0]

@@ -121,6 +121,10 @@ class Workspace:
             raise OptionError(
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
+        if os.path.lexists(self.path) and not self.path.is_dir():
+            raise OptionError(
+                f"{self.path}: is not a folder; give a new or an empty one as --output-path"
+            )
         with suppress(OSError):  # not there, or refused when it is to be used
             foreign = []
             for path in self.path.iterdir():

@@ -17,7 +17,12 @@ from colmap_affrect.errors import (
     such_as,
 )
 from colmap_affrect.features.weights import digests
-from colmap_affrect.images.photographs import checked_names, left_out, not_named
+from colmap_affrect.images.photographs import (
+    checked_names,
+    left_out,
+    not_named,
+    require_folder,
+)
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.paths import PathLike
@@ -97,6 +102,8 @@ def extract(
     failures = _extract_missing(
         context, inputs, extractor, names=missing, contents=contents, warnings=warnings
     )
+    if failures:
+        require_folder(folder)  # else it has gone with all that was still to come
     _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(

@@ -5,7 +5,14 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Container,
+    Generator,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -14,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError, PartError
+from colmap_affrect.errors import OptionError, PartError, StoreError, such_as
 from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -314,6 +321,24 @@ class Matching:
     num_kept: int = USUAL_IMAGES_IN_MEMORY
 
 
+def _require_features(
+    store: FeatureStore, names: Container[str], pairs: Sequence[Pair]
+) -> None:
+    """Refuse pairs of images whose features are gone; StoreError.
+
+    Args:
+        store: Of the features.
+        names: Of the images that have some.
+        pairs: Of image names.
+    """
+    lost = {name for pair in pairs for name in pair if name not in names}
+    if lost:
+        names_lost = such_as(sorted(lost))
+        raise StoreError(
+            f"{store.path}: no features of {names_lost}; run extract first"
+        )
+
+
 def iterate_matches(
     pairs: Sequence[Pair], matching: Matching, executor: Executor | None = None
 ) -> Generator[PairMatches, None, None]:
@@ -325,6 +350,7 @@ def iterate_matches(
         return
     executor = executor or Threads(available_cores())
     counts = matching.store.num_keypoints()
+    _require_features(matching.store, counts, pairs)
     limit = matching.max_num_features
     if limit:
         counts = {name: min(count, limit) for name, count in counts.items()}

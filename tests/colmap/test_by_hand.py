@@ -47,6 +47,7 @@ def test_tables_may_have_any_order_of_columns_and_short_names(
     ("p,a.jpg,1,two\n", "line 1: x and y must be numbers"),
     ("point,photograph,x,y\n,a.jpg,1,2\n", "line 2: must name a point and a photograph"),
     ("p,a.jpg,1,2\n", "no point is marked in two photographs"),
+    ("p,a.jpg,1,2\np,c,4,5\np,a,9,2\n", "line 3: p is at 1, 2 of old/a.jpg already"),
     ("point,photograph,x,y,colour\np,a,1,2,red\n", "unknown column 'colour'"),
 ])  # fmt: skip
 def test_what_cannot_be_used_is_refused_in_one_line(

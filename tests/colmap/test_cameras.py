@@ -60,7 +60,8 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
     (["name,focal_px", "a,3", "a,4"], "line 3: a is there twice"),
     (["name,focal_px", "a,3,4"], "line 2: has 3 cells and the first line 2; values with commas"),
     (["name,focal_px", "a,long"], "line 2: focal_px='long': should be a valid number"),
-    (["name,focal_px", "a,0"], "line 2: focal_px='0': should be greater than 0"),
+    (["name,focal_px", "a,0"], "line 2: focal_px='0': should be greater than or equal to 0.001"),
+    (["name,focal_px", "a,1e-300"], "line 2: focal_px='1e-300': should be greater than or"),
     (["name,focal_px", "a,1e999"], "a finite number"),
     (["name,focal_mm", "a,50"], "line 2: focal_mm needs plate_width_mm"),
     (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
@@ -91,6 +92,7 @@ def test_wrong_tables_are_one_clear_line(
     ),
     ({"model": "PINHOL"}, "--camera-model, .* model: PINHOL is not one of"),
     ({"params": "0,450,300,0"}, "params: a focal length of 0 px cannot be"),
+    ({"params": "1e-300,450,300,0"}, "params: a focal length of 1e-300 px cannot be"),
     ({"principal_point": "1"}, "--principal-point: cy='': should be a valid number"),
     ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
 ])  # fmt: skip

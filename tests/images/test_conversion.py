@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
+from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError, OptionError, WorkspaceError
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images import conversion, reading
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
@@ -233,3 +236,34 @@ def test_long_file_whose_pixels_need_it_is_read(
     path = tmp_path / "a.png"
     picture(1).save(path)
     assert len(reading.read_photograph(path)) == path.stat().st_size > 1000
+
+
+def test_copies_that_are_removed_while_others_are_made_are_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = tmp_path / "photos"
+    write_photographs(photos)
+    usual = reading.read_photograph
+    num_read = 0
+
+    def remove(path: Path) -> Bytes:
+        nonlocal num_read
+        num_read += 1
+        if num_read == 3:
+            for made in tmp_path.glob(".*"):
+                shutil.rmtree(made)
+        return usual(path)
+
+    monkeypatch.setattr(reading, "read_photograph", remove)
+    with pytest.raises(WorkspaceError, match="removed meanwhile"):
+        convert_images(photos, tmp_path / "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_folder_of_which_nothing_can_be_decoded_leaves_none(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_text("none")
+    with pytest.raises(ImageError, match=r"none of 1 files .* the first: .*a\.jpg"):
+        convert_images(photos, tmp_path / "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]

@@ -24,8 +24,9 @@ from colmap_affrect.images.photographs import (
     Photographs,
     left_out,
     list_images,
+    photograph_files,
 )
-from colmap_affrect.images.reading import read_mask, shrink_mask
+from colmap_affrect.images.reading import read_mask, read_photograph, shrink_mask
 from colmap_affrect.project.stores import FeatureStore
 
 
@@ -235,6 +236,16 @@ def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
     assert found["*.mp4"].startswith(
         "1 left out, such as film.MP4: it is a video; take"
     )
+
+
+def test_photograph_that_is_a_link_in_a_circle_keeps_no_other_one_back(
+    tmp_path: Path,
+) -> None:
+    touch(tmp_path, "a.png", "c.png")
+    (tmp_path / "b.png").symlink_to("b.png")
+    assert photograph_files(tmp_path) == ["a.png", "b.png", "c.png"]
+    with pytest.raises(ImageError, match=r"b\.png: cannot be read"):
+        read_photograph(tmp_path / "b.png")
 
 
 def test_linked_folders_are_followed_and_each_folder_is_taken_once(

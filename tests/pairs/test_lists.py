@@ -178,7 +178,8 @@ def test_read_pairs_lists_unknown_names_with_line_and_suggestion(
 @pytest.mark.parametrize(("content", "error", "message"), [
     (b"# nothing\n", AffrectError, "holds no pair of two different images"),
     (b"a.png a.png\n", AffrectError, "holds no pair of two different images"),
-    (b"\xff\xfe\x00a", AffrectError, r"list of pairs\.txt: cannot be read"),
+    ("a.png b.png\n".encode("utf-16"), OptionError, r"pairs\.txt: is no text in UTF-8; save"),
+    (b"\0" * 5000, OptionError, r"line 1: '.{150,250}' is not two names of images$"),
     (None, OptionError, r"list of pairs\.txt: cannot be read"),
 ])  # fmt: skip
 def test_read_pairs_refuses_other_files(

@@ -284,6 +284,16 @@ def test_replace_text_that_fails_keeps_the_old_text(
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_file_whose_folder_is_gone_is_not_said_to_be_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    with pytest.raises(
+        WorkspaceError, match=r"its folder is gone; run the same"
+    ) as end:
+        replace_text(folder / "file.txt", "new")
+    assert "kept" not in str(end.value)
+    assert not folder.exists()
+
+
 def test_require_space_finds_room_or_says_that_there_is_none(tmp_path: Path) -> None:
     require_space(tmp_path / "file", 1 << 20)
     with pytest.raises(WorkspaceError, match=r"file: cannot be written .*; free space"):

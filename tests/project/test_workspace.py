@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -165,6 +166,19 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
     assert str(workspace.path / name.split("/")[0]) in str(error.value)
     assert path.read_bytes() == b"SQLite format 3\0 or so"
     assert not workspace.config.exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "pipe", "link to nothing"])
+def test_what_is_no_folder_is_not_taken_for_one(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "out"
+    if kind == "file":
+        path.write_text("mine")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("nowhere")
+    with pytest.raises(OptionError, match=r"out: is not a folder; give a new or an em"):
+        Workspace(path).require_own()
 
 
 def test_only_empty_folders_and_our_own_are_taken(tmp_path: Path) -> None:

@@ -267,6 +267,27 @@ def test_array_that_was_never_written_is_not_read(tmp_path: Path) -> None:
             given.read("a/keypoints", (None, 2))
 
 
+def test_array_that_a_plugin_has_compressed_is_not_called_damaged(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "features.h5"
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((5, 2))
+    properties.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, (3,))  # Zstandard
+    kind = h5py.h5t.py_create(np.dtype("f4"))
+    with h5py.File(path, "w") as file:
+        group = file.create_group("a").id
+        space = h5py.h5s.create_simple((5, 2))
+        array = h5py.h5d.create(group, b"keypoints", kind, space, properties)
+        array.write_direct_chunk((0, 0), bytes(30), 0)
+        usual = {"compression": "gzip", "shuffle": True, "fletcher32": True}
+        file.create_dataset("b/keypoints", data=np.ones((5, 2)), **usual)
+    with open_given_file(path) as given:
+        assert given.read("b/keypoints", (None, 2)).shape == (5, 2)
+        with pytest.raises(AffrectError, match=r"h5: a/keypoints .*\(filter 32015\)"):
+            given.read("a/keypoints", (None, 2))
+
+
 def test_groups_of_any_depth_are_one_line(tmp_path: Path) -> None:
     """HDF5 takes the square of the depth for them."""
     path = tmp_path / "features.h5"

@@ -358,18 +358,19 @@ def test_a_photograph_that_vanishes_while_a_run_works_is_left_out(
     assert done.report["images_registered"] == 4
 
 
+@pytest.mark.parametrize("name", ["_extract_missing", "write_images_and_keypoints"])
 def test_a_folder_that_vanishes_while_a_run_works_is_one_line(
-    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     photos = tmp_path / "photos"
     write_photographs(photos)
-    usual = extract_stage.write_images_and_keypoints
+    usual = getattr(extract_stage, name)
 
     def vanish(*given: object) -> object:
         photos.rename(tmp_path / "gone")
         return usual(*given)
 
-    monkeypatch.setattr(extract_stage, "write_images_and_keypoints", vanish)
+    monkeypatch.setattr(extract_stage, name, vanish)
     done = call("run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST)
     assert (done.code, len(done.errors)) == (2, 1)
     assert done.errors[0].startswith(f"error: {photos}: no such folder")

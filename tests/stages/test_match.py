@@ -13,7 +13,7 @@ from small_scene import NAMES as PHOTOGRAPHS
 from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers.lightglue import LightGlueOptions
@@ -80,6 +80,17 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     )
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
+
+
+def test_images_whose_features_have_gone_meanwhile_are_named(
+    store: FeatureStore,
+) -> None:
+    pairs = exhaustive_pairs(NAMES)
+    store.remove(NAMES[4:])
+    with pytest.raises(
+        StoreError, match=r"features\.h5: no features of 4\.png, 5\.png"
+    ):
+        list(iterate_matches(pairs, Matching(store, NearestOptions())))
 
 
 def test_the_strongest_features_are_matched_first(store: FeatureStore) -> None:
