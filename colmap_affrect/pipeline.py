@@ -33,16 +33,16 @@ from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport, installed_versions, summed
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.advice import advice
-from colmap_affrect.report.pairs import draw_pairs_to_check
-from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.report.photographs import photographs_of_report
+from colmap_affrect.report.run_files import write_results
 from colmap_affrect.report.run_report import (
     RunReport,
     cameras_of_report,
+    contradictions_of_report,
     lines_of_report,
 )
 from colmap_affrect.session.context import Context, Resources
@@ -487,6 +487,8 @@ def map_and_report(
         pair: n for pair, n in verified.items() if context.by_hand.allows(*pair)
     }
     missing = unregistered(context, names, models, pair_inliers)
+    cameras = cameras_of_report(workspace, models, before)
+    lines = {} if copied else lines_of_report(context.features, names)
     again = matched_again(context)
     strongest = max(pair_inliers.values(), default=0)
     result = RunReport(
@@ -505,8 +507,10 @@ def map_and_report(
         verification=context.verification.to_mapping(),
         mapping=options.to_mapping(),
         guided={} if copied else guided_counts(context),
-        cameras=cameras_of_report(workspace, models, before),
-        lines={} if copied else lines_of_report(context.features, names),
+        cameras=cameras,
+        lines=lines,
+        photographs=photographs_of_report(workspace, names, models, cameras, lines),
+        focal_contradictions=contradictions_of_report(context),
         extended=tuple(before),
         advice=advice(context, missing, models, strongest, again.untried, again.effort),
         by_hand=context.by_hand.texts(),
@@ -514,15 +518,7 @@ def map_and_report(
         matched_again=again.tried,
         untried=again.untried,
     )
-    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
-    replace_text(workspace.report, result.to_json())
-    if page:
-        pictures = draw_pairs_to_check(context, result, pair_inliers)
-        cameras = context.graph.cameras
-        content = RunContent(
-            names, pair_inliers, workspace.photographs(), marks, pictures, cameras
-        )
-        write_run_page(workspace, result, content, context.progress)
+    write_results(context, result, names, pair_inliers, marks if page else None)
     return result
 
 

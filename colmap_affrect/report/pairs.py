@@ -177,12 +177,16 @@ def _legend(kinds: Indices) -> ColorImage:
 
 
 def draw_pairs_to_check(
-    context: Context, report: ReconstructionReport, num_inliers: Mapping[Pair, int]
+    context: Context,
+    reader: PairReader,
+    report: ReconstructionReport,
+    num_inliers: Mapping[Pair, int],
 ) -> list[PairPicture]:
     """Draw the pairs of a run that a person should look at.
 
     Args:
         context: of the run.
+        reader: of its pairs.
         report: of the run.
         num_inliers: of the verified pairs that may be used.
 
@@ -192,7 +196,6 @@ def draw_pairs_to_check(
     image_path = context.workspace.photographs()
     if not image_path:
         return []
-    reader = PairReader(context.graph, context)
     chosen = pairs_to_check(
         report,
         num_inliers,

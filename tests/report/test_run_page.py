@@ -33,9 +33,11 @@ def html(folder: Path) -> str:
 
 def test_everything_of_the_report_is_told(html: str) -> None:
     for text in (
-        "<title>4 of 6 photographs registered</title>", "right with a probability of 95%",
+        "<title>2 of 6 photographs are placed surely, 1 unsure, 1 doubtful, 2 not placed</title>",
+        "Next: one camera.", "sparse/0: 4 photographs", "Not placed: 2",
+        "sure: 95% probable", "unsure: 70% probable; bridged by &lt;img src=x",
         "d.png: may be a mirrored copy of &lt;b&gt;.jpg",
-        "right with a probability of 40%; doubtful: may",
+        "doubtful: 40% probable; may be a mirrored",
         ">colmap-affrect run --output-path out-2<", "no verified pair",
         "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
@@ -44,7 +46,12 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "colmap-affrect show-pair OUT", "model: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html
-    parts = ["Low-confidence images", "What to try next", "<main>"]
+    parts = [
+        "Next: one camera",
+        "Why photographs are not sure",
+        "What to try next",
+        "<main>",
+    ]
     positions = [html.index(part) for part in parts]
     assert positions == sorted(positions)
 
@@ -63,7 +70,7 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
         base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         for script in re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     ]
-    assert len(digests) == 2
+    assert len(digests) == 4
     allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
     assert markup.unescape(policy) == (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
@@ -72,10 +79,8 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
 
 def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
     data = json.loads(html.split('id="data">')[1].split("</script>")[0])
-    assert data["tie_points"] == {
-        "photographs": [[n, *IMAGE_SIZE] for n in NAMES],
-        "marks": [],
-    }
+    assert data["tie_points"]["photographs"] == [[n, *IMAGE_SIZE] for n in NAMES]
+    assert data["tie_points"]["marks"] == []
 
 
 def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:
@@ -90,7 +95,7 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(
     assert data["names"][0] == NAMES[0]
     (view,) = data["views"]
     kinds = {camera["index"]: camera["kind"] for camera in view["cameras"]}
-    assert kinds == {0: "tracks", 1: "tracks", 2: "bridged", 3: "doubtful"}
+    assert kinds == {0: "sure", 1: "sure", 2: "unsure", 3: "doubtful"}
     model = pycolmap.Reconstruction(folder / "out" / "sparse" / "0")
     centers = {image.name: image.projection_center() for image in model.images.values()}
     shown = np.array([camera["corners"][:3] for camera in view["cameras"]])
@@ -139,6 +144,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
         "models": (),
         "num_verified_pairs": 0,
         "unregistered": dict.fromkeys(NAMES, Missing("no_features")),
+        "photographs": {},
         "cameras": (),
     }
     nothing = type(report)(**{**vars(report), **values})
