@@ -169,7 +169,9 @@ def corner_distortion_px(camera: pycolmap.Camera) -> float | None:
     straight_px = float(np.linalg.norm(focal * ray[0]))
     distorted_px = float(np.linalg.norm(corner[0] - axis))
     difference_px = distorted_px - straight_px
-    return round(difference_px, 1) if math.isfinite(difference_px) else None
+    if not math.isfinite(difference_px):
+        return None
+    return round(difference_px, 1) + 0.0  # not -0.0
 
 
 def facts_of(

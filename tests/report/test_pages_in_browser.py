@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -302,4 +304,22 @@ def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
     found = "[...document.querySelectorAll('button:not(.photo, .chip)')]"
     buttons = f"return {found}.map((b) => b.offsetWidth)"
     assert set(browser.run(buttons)) == {0}
+    browser.command("Emulation.setEmulatedMedia", media="")
+
+
+MAX_NUM_PRINTED = 4  # pages of a run of ten photographs
+PRINTED_PX = 680  # width of A4 without its margins
+
+
+def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
+    browser: Browser,
+) -> None:
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")
+    options = {"preferCSSPageSize": True, "printBackground": True}
+    data = base64.b64decode(browser.command("Page.printToPDF", **options)["data"])
+    assert 1 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", data)) <= MAX_NUM_PRINTED
+    browser.resize(PRINTED_PX)
+    browser.command("Emulation.setEmulatedMedia", media="print")
+    width = "return document.documentElement.scrollWidth"
+    assert browser.run(width) <= PRINTED_PX
     browser.command("Emulation.setEmulatedMedia", media="")
