@@ -102,7 +102,8 @@ def run(
         effort=options.effort,
         command=options.command,
     )
-    return _run(context, image_path, options, overwrite=overwrite, page=page)
+    with context.progress.never_silent():
+        return _run(context, image_path, options, overwrite=overwrite, page=page)
 
 
 def _run(
@@ -202,6 +203,7 @@ def one_stage(
     is_first = name == "extract"
     discards = is_first and overwrite
     with (
+        context.progress.never_silent(),
         context.workspace.locked(),
         watched(context, follows=not is_first, maps=name == "map", discards=discards),
     ):
@@ -426,6 +428,7 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     extension = as_extension(extend)
     _check_foreign(context, foreign, mapper, extension, overwrite=overwrite)
     with (
+        context.progress.never_silent(),
         context.workspace.locked(),
         watched(context, follows=False, discards=overwrite),
     ):
