@@ -12,7 +12,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pictures import base64_text
 
-MAX_NUM_LINES = 40_000  # of all pairs, 9 bytes each: a page stays below some MB
+MAX_NUM_LINES = 24_000  # of all pairs, 9 bytes each: a page stays below some MB
 MAX_NUM_LINES_OF_PAIR = 120  # more hide what is below them
 MIN_NUM_LINES_OF_PAIR = 20  # fewer show little; then only the strongest pairs have some
 MOST = 65_535  # of a uint16

@@ -65,7 +65,7 @@ LEGEND = {LABELS[kind]: COLORS[kind] for kind in MatchKind}
 
 # Sizes and numbers were chosen by eye.
 MAX_NUM_LINES = 200  # of inliers, and as many of rejected matches
-SIDE_PX = 450  # longer side of photographs in a page
+SIDE_PX = 380  # longer side of photographs in a page
 SHEET_SIDE_PX = 900  # of photographs in a picture of its own
 POINT_RADIUS_PX = 3  # of a disk at the end of a line
 LEGEND_BAR_PX = (150, 4)  # (width, height) of the bar of a colour

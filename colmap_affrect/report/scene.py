@@ -19,7 +19,7 @@ from colmap_affrect.report.upright import upright_of_run
 # What is in the view, and how it is drawn, was chosen by eye.
 MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
 # Of them in photographs, 6 bytes each; of points beyond that the page does not tell who sees them
-MAX_NUM_OBSERVATIONS = 80_000
+MAX_NUM_OBSERVATIONS = 50_000
 NUM_GRID = 12  # rows and columns of places that radial distortion is fitted to
 # Share of the points, by distance from their median, that is in the view
 POINT_PERCENTILE = 90.0
