@@ -120,6 +120,7 @@ def _run(
     mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
+    inputs.check()
     _check_extension(options.extend, mapper, workspace.path, overwrite=overwrite)
     _check_by_hand(
         options.by_hand, names, mapper, lambda name: header_size(image_path / name)

@@ -81,20 +81,19 @@ def _headline(num: int, counts: Mapping[Quality, int], num_models: int) -> str:
     if not num_placed:
         return f"None of {num} photographs could be placed"
     num_sure = counts.get("sure", 0)
-    where = f" in {num_models} models" if num_models > 1 else ""
+    models = f", in {num_models} models" if num_models > 1 else ""
     if num_sure == num:
-        return f"All {num} photographs are placed surely{where}"
+        return f"All {num} photographs are placed surely{models}"
     if not num_sure:
         return (
-            f"{num_placed} of {num} photographs are placed{where}, none of them surely"
+            f"{num_placed} of {num} photographs are placed, none of them surely{models}"
         )
     others = []
     for quality, count in counts.items():
         if quality != "sure":
             others.append(f"{count} {QUALITIES[quality]}")
-    return (
-        f"{num_sure} of {num} photographs are placed surely{where}, {', '.join(others)}"
-    )
+    text = f"{num_sure} of {num} photographs are placed surely, {', '.join(others)}"
+    return f"{text}; {num_models} models" if num_models > 1 else text
 
 
 def _next_step(
@@ -133,7 +132,8 @@ def _components(
     for model in sorted(key for key in groups if key is not None):
         numbers = groups[model]
         some = [photographs[names[number]] for number in numbers]
-        title = f"sparse/{model}: {len(numbers)} photographs"
+        photographs_text = "photograph" if len(numbers) == 1 else "photographs"
+        title = f"sparse/{model}: {len(numbers)} {photographs_text}"
         found.append(Component(title, tuple(numbers), _counts(some), model))
     lost = groups.get(None, [])
     if lost:

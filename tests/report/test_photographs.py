@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -158,12 +159,31 @@ def test_shared_points_are_counted_for_each_pair(
         assert seen.num_shared[two, one] == seen.num_shared[one, two]
 
 
-@pytest.mark.parametrize(("qualities", "headline"), [
+QUALITIES_AND_HEADLINES = [
     (["sure", "sure"], "All 2 photographs are placed surely"),
     (["unsure", "doubtful"], "2 of 2 photographs are placed, none of them surely"),
     (["sure", "sure", "missing"], "2 of 3 photographs are placed surely, 1 not placed"),
     (["missing", "missing"], "None of 2 photographs could be placed"),
-])  # fmt: skip
+]  # fmt: skip
+
+
+def test_a_headline_counts_models_apart_from_what_is_sure(tmp_path: Path) -> None:
+    report = small_report(tmp_path)
+    (model,) = report.models
+    photographs = {
+        "a": PhotographReport("sure", 0),
+        "b": PhotographReport("doubtful", 1),
+    }
+    several = replace(report, models=(model, model))
+    verdict = verdict_of(several, ["a", "b"], photographs)
+    assert verdict.headline == (
+        "1 of 2 photographs are placed surely, 1 doubtful; 2 models"
+    )
+    titles = [component.title for component in verdict.components]
+    assert titles == ["sparse/0: 1 photograph", "sparse/1: 1 photograph"]
+
+
+@pytest.mark.parametrize(("qualities", "headline"), QUALITIES_AND_HEADLINES)
 def test_the_headline_praises_only_what_is_sure(
     qualities: list, headline: str, tmp_path: Path
 ) -> None:
