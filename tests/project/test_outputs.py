@@ -166,7 +166,9 @@ BY_THE_DOOR = {
 }  # fmt: skip
 """Write where the door lets them."""
 
-IN_WORK_FOLDERS = {"worker.py", "method_run.py", "evaluate.py", "__init__.py"}
+IN_WORK_FOLDERS = {
+    "worker.py", "method_run.py", "evaluate.py", "__init__.py", "run_files.py",
+}  # fmt: skip
 """Write where the door has refused folders of others, and links."""
 
 
