@@ -43,7 +43,7 @@ from colmap_affrect.report.verdict import QUALITIES, SIGNS, verdict_of
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
-NUM_KEY_LETTERS = 16  # of the digest by which a browser keeps marks
+NUM_KEY_LETTERS = 16  # of the digests by which a browser keeps marks and masks
 
 SCRIPTS = ("page.js", "geometry.js", "pairs.js", "viewer.js")
 TOOL_SCRIPTS = ("tie_points.js", "masks.js")
@@ -273,9 +273,12 @@ def _tools(report: RunReport, content: RunContent) -> dict[str, Any]:
     for name in names:
         camera = content.cameras.get(name)
         sizes.append([name, camera.width, camera.height] if camera else None)
-    # Marks that a browser keeps belong to these photographs, and to what was given before
+    # What a browser keeps belongs to these photographs, marks also to those given before
     key = digest_of([sizes, rows])[:NUM_KEY_LETTERS]
-    return {"tie_points": {"photographs": sizes, "marks": rows, "key": key}}
+    return {
+        "tie_points": {"photographs": sizes, "marks": rows, "key": key},
+        "masks_key": digest_of(sizes)[:NUM_KEY_LETTERS],
+    }
 
 
 def inlier_matrix(names: Sequence[str], num_inliers: Mapping[Pair, int]) -> str:

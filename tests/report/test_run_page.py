@@ -19,6 +19,7 @@ from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
+from colmap_affrect.session.view_graph import ViewGraph
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +82,21 @@ def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
     data = json.loads(html.split('id="data">')[1].split("</script>")[0])
     assert data["tie_points"]["photographs"] == [[n, *IMAGE_SIZE] for n in NAMES]
     assert data["tie_points"]["marks"] == []
+
+
+def test_marks_that_a_browser_keeps_are_of_one_run_and_masks_of_its_photographs(
+    folder: Path, html: str, tmp_path: Path
+) -> None:
+    """Marks that were given to a run are in its page, and what was kept before is old."""
+    before = json.loads(html.split('id="data">')[1].split("</script>")[0])
+    cameras = ViewGraph(Workspace(folder / "out").database).cameras
+    marks = {"1": {NAMES[0]: np.array([3.0, 4.0])}}
+    content = RunContent(NAMES, {}, marks=marks, cameras=cameras)
+    page = write_run_page(Workspace(tmp_path), small_report(tmp_path), content)
+    text = page.read_text(encoding="utf-8")
+    after = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert after["tie_points"]["key"] != before["tie_points"]["key"]
+    assert after["masks_key"] == before["masks_key"]
 
 
 def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:

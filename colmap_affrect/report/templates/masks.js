@@ -2,8 +2,8 @@
 // Masks: a person covers parts of photographs and saves them as the folder of --mask-path.
 (() => {
   const { data, label, picture, limited } = page;
-  const { photographs, key } = data.tie_points; // [name, width, height] as stored, or null
-  const STORED = `colmap-affrect masks ${key}`;
+  const { photographs } = data.tie_points; // [name, width, height] as stored, or null
+  const STORED = `colmap-affrect masks ${data.masks_key}`;
   const COVER = "rgb(200 0 80 / 60%)";
   const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
   const STEP = 0.01; // of the longer side, by a key
