@@ -95,7 +95,8 @@ def run(
         effort=options.effort,
         command=options.command,
     )
-    return _run(context, image_path, options, overwrite=overwrite, page=page)
+    with context.progress.never_silent():
+        return _run(context, image_path, options, overwrite=overwrite, page=page)
 
 
 def _run(
@@ -112,6 +113,7 @@ def _run(
     mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
+    inputs.check()
     _check_extension(
         options.extend, mapper, output_path=workspace.path, overwrite=overwrite
     )
@@ -207,6 +209,7 @@ def one_stage(
     """
     is_first = name == "extract"
     with (
+        context.progress.never_silent(),
         context.workspace.locked(),
         mend_and_seal(
             context,
@@ -443,6 +446,7 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
     extension = as_extension(extend)
     _check_foreign(context, foreign, mapper, extend=extension, overwrite=overwrite)
     with (
+        context.progress.never_silent(),
         context.workspace.locked(),
         mend_and_seal(context, follows=False, discards=overwrite),
     ):

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TextIO
 
 from tqdm import tqdm
@@ -20,6 +20,48 @@ COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 of 8 to 1000 photographs, good for a factor of 2."""
 # Of a stage: before, it has loaded files and networks, and says too little; display
 MIN_ELAPSED_S = 3.0
+
+
+# Of silence, until something says that the work goes on (judged); where lines stay, as in a log,
+# twice as long after each of them, up to the longest
+QUIET_S = 5.0
+LONGEST_QUIET_S = 60.0
+
+
+class Voice:
+    """When something was shown last, and about what: one for all stages of a command."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.doing = "beginning"
+        self._clock = clock
+        self._heard_s = clock()  # when something was shown last
+        self._since_s = (
+            self._heard_s
+        )  # when what is done last showed something of its own
+        self._quiet_s = QUIET_S
+
+    def heard(self, doing: str) -> None:
+        """Something was shown."""
+        self.doing = doing
+        self._heard_s = self._clock()
+        self._since_s = self._heard_s
+        self._quiet_s = QUIET_S
+
+    def wanted(self, *, stays: bool) -> str:
+        """Return what to say after a silence, and take it as said; empty while there was none.
+
+        Args:
+            stays: whether each line stays, as in a log; else the next one replaces it.
+        """
+        now_s = self._clock()
+        if now_s - self._heard_s < self._quiet_s:
+            return ""
+        self._heard_s = now_s
+        self._quiet_s = 1.0  # a line that is replaced counts the seconds
+        if stays:
+            silent_s = now_s - self._since_s
+            self._quiet_s = min(max(QUIET_S, silent_s), LONGEST_QUIET_S)
+        return f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
 
 
 class Forecast:
@@ -82,12 +124,14 @@ class Progress:
         num_plain_lines: most lines of a stage, where the stream takes no bars.
         title: with which the names of stages begin.
         forecast: says how long all stages take.
+        voice: knows when something was shown last.
     """
 
     stream: TextIO | None = None
     num_plain_lines: int = NUM_PLAIN_LINES
     title: str = ""
     forecast: Forecast | None = None
+    voice: Voice = field(default_factory=Voice)
 
     @classmethod
     def given(cls, progress: "GivenProgress") -> "Progress":
@@ -138,19 +182,23 @@ class Progress:
             yield lambda _: None
         elif self.takes_bars:
             yield from self._bar(name, total, unit)
+            self.voice.heard(f"after {self.title}{name}")
         else:
+            self.voice.doing = self.title + name
             yield from self._lines(name, total, unit)
+            self.voice.doing = f"after {self.title}{name}"
 
     def _bar(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show a stage as a bar; yield what is called with the number of units done."""
-        bar = tqdm(total=total, desc=self.title + name, unit=unit, file=self.stream)
+        title = self.title + name
+        bar = tqdm(total=total, desc=title, unit=unit, file=self.stream)
 
         def advance(count: int) -> None:
             text = self._remaining_text(bar.n + count, total)
             bar.set_postfix_str(text, refresh=False)
             bar.update(count)
 
-        with bar, _refresh_each_second(bar):
+        with bar, _refresh_each_second(bar, self.voice, title):
             yield advance
 
     def _lines(self, name: str, total: int, unit: str) -> Iterator[Advance]:
@@ -159,9 +207,10 @@ class Progress:
         num_lines = 0
 
         def print_line(text: str) -> None:
+            counts = f"{self.title}{name}: {num_done}/{total} {unit}"
             more = f", {text}" if text else ""
-            line = f"{self.title}{name}: {num_done}/{total} {unit}{more}"
-            show(line, file=self.stream)
+            show(counts + more, file=self.stream)
+            self.voice.heard(counts)
 
         def advance(count: int) -> None:
             nonlocal num_done, num_lines
@@ -180,15 +229,50 @@ class Progress:
         """Say how long the first model takes, where that is known."""
         return self.forecast.text(num_done / total) if self.forecast else ""
 
+    @contextmanager
+    def never_silent(self, interval_s: float = 1.0) -> Iterator[None]:
+        """Say that the work goes on, for as long as the context lasts and nothing else speaks."""
+        stream = self.stream
+        if stream is None:
+            yield
+            return
+        is_over = threading.Event()
+        replaces = self.takes_bars
+        longest = 0
+        self.voice.heard(f"{self.title}beginning")
+
+        def listen() -> None:
+            nonlocal longest
+            while not is_over.wait(interval_s):
+                text = self.voice.wanted(stays=not replaces)
+                if text and replaces:
+                    longest = max(longest, len(text))
+                    stream.write(f"\r{shown(text).ljust(longest)}")
+                    stream.flush()
+                elif text:
+                    show(text, file=stream)
+
+        thread = threading.Thread(target=listen, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            thread.join()
+            if longest:
+                stream.write(f"\r{' ' * longest}\r")
+
 
 @contextmanager
-def _refresh_each_second(bar: tqdm) -> Iterator[None]:
+def _refresh_each_second(bar: tqdm, voice: Voice, title: str) -> Iterator[None]:
     """Show each second how long a bar has run: one unit may take a minute."""
     is_over = threading.Event()
+    voice.heard(title)
 
     def tick() -> None:
         while not is_over.wait(1.0):
             bar.refresh()
+            voice.heard(title)
 
     thread = threading.Thread(target=tick, daemon=True)
     thread.start()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,17 @@ from colmap_affrect.project.report import (
     Advice,
     Bridge,
     ModelSummary,
-    ReconstructionReport,
     StageReport,
 )
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.pair_lines import lines_of_pairs
+from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import PairPicture
+from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.run_page import RunContent, write_run_page
+from colmap_affrect.report.run_report import RunReport
+from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 
 NAMES = (
@@ -36,7 +41,7 @@ NAMES = (
 MORE = Advice("more photographs")
 
 
-def small_report(folder: Path) -> ReconstructionReport:
+def small_report(folder: Path) -> RunReport:
     """Four of six photographs, each of which came in in another way; paths in what is said."""
     model = ModelSummary(
         NAMES[:4],
@@ -44,6 +49,7 @@ def small_report(folder: Path) -> ReconstructionReport:
         3.5,
         0.25,
         doubtful={NAMES[3]: (Doubt("mirrored_copy", {"original": "<b>.jpg"}),)},
+        unsure={NAMES[2]: (Doubt("few_matches"),)},
         probabilities=dict(zip(NAMES, (0.99, 0.95, 0.7, 0.4), strict=False)),
         bridges={NAMES[2]: Bridge(NAMES[0], 12, 15, 0.031)},
     )
@@ -52,7 +58,8 @@ def small_report(folder: Path) -> ReconstructionReport:
         "refined_px": 204.4, "why": "one of them",
     }  # fmt: skip
     failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
-    return ReconstructionReport(
+    return RunReport(
+        output_path=folder,
         images_total=6,
         unregistered={
             NAMES[4]: Missing("no_verified_pair"),
@@ -83,12 +90,12 @@ def small_report(folder: Path) -> ReconstructionReport:
 
 def make_run_page(folder: Path) -> Path:
     """Write the page of the small run."""
-    photographs = folder / "photographs"
-    photographs.mkdir()
+    photographs_path = folder / "photographs"
+    photographs_path.mkdir()
     for number, name in enumerate(NAMES[:5]):
         write_image(folder / "texture.png", texture(IMAGE_SIZE, number))
-        (folder / "texture.png").rename(photographs / name)
-    (photographs / NAMES[5]).write_bytes(b"no image")
+        (folder / "texture.png").rename(photographs_path / name)
+    (photographs_path / NAMES[5]).write_bytes(b"no image")
     workspace = Workspace(folder / "out")
     (workspace.sparse / "0").mkdir(parents=True)
     model, pairs = write_scene(workspace.database, NAMES)
@@ -103,8 +110,18 @@ def make_run_page(folder: Path) -> Path:
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
-    cameras = ViewGraph(workspace.database).cameras
-    content = RunContent(
-        NAMES, pairs, photographs, pairs_to_check=[pair] * 3, cameras=cameras
+    graph = ViewGraph(workspace.database)
+    reader = PairReader(graph, Context(workspace))
+    report = small_report(folder)
+    photographs = photographs_of_report(
+        workspace, NAMES, report.models, report.cameras, {}
     )
-    return write_run_page(workspace, small_report(folder), content)
+    content = RunContent(
+        NAMES,
+        pairs,
+        photographs_path,
+        pairs_to_check=[pair] * 3,
+        pair_lines=lines_of_pairs(reader, NAMES, pairs),
+        cameras=graph.cameras,
+    )
+    return write_run_page(workspace, replace(report, photographs=photographs), content)

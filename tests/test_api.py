@@ -311,8 +311,8 @@ class Text(HTMLParser):
 
 def report_of(folder: Path, **changes: Any) -> RunReport:
     """The report of a small run, as if its folder were there."""
-    values = vars(small_report(folder)) | changes
-    return RunReport(output_path=folder / "out", **values)
+    values = vars(small_report(folder)) | changes | {"output_path": folder / "out"}
+    return RunReport(**values)
 
 
 def test_a_notebook_shows_counts_photographs_and_what_to_try(

@@ -10,7 +10,7 @@ from colmap_affrect.comparison.results import (
     MethodResult,
     SeedResult,
 )
-from colmap_affrect.comparison.tables import headline, notes, table
+from colmap_affrect.comparison.tables import conclusion, headline, notes, table
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.report.page import Page
@@ -66,6 +66,7 @@ def write_page(
         template=TEMPLATE,
         content={
             "comparison": comparison,
+            "conclusion": conclusion(comparison),
             "headline": headline(comparison),
             "notes": notes(comparison),
             "methods": comparison.finished,

@@ -21,6 +21,9 @@ BYTES_PER_MB = 1_000_000  # theory
 NOTHING = "-"  # where there is no number
 MIN_IMAGES = 3  # of a reconstruction; two images are a pair; theory
 MAX_NAMES = 6  # of photographs in a sentence; display
+# Photographs by which two means over seeds differ at least where one method places more; display
+MIN_DIFFERENCE = 0.5
+SAME_TIME = 1.1  # ratio of seconds up to which two methods take as long; display
 WIDTH = 88  # columns of text in the terminal; display
 
 
@@ -69,7 +72,46 @@ def number_text(number: float, digits: int) -> str:
 
 def verdict(comparison: Comparison) -> list[str]:
     """Return what the numbers mean, the most important paragraph first."""
-    return [*headline(comparison), *notes(comparison)]
+    ending = conclusion(comparison)
+    return [*headline(comparison), *notes(comparison), *filter(None, [ending])]
+
+
+def conclusion(comparison: Comparison) -> str:
+    """Answer in a sentence whether our features are worth it; empty where nothing compares."""
+    finished = {method.name: method for method in comparison.finished}
+    colmap = finished.get(SIFT_COLMAP) or finished.get(SIFT)
+    ours = [one for name, one in finished.items() if name not in SIFT_SUMMARIES]
+    if not colmap or not ours:
+        return ""
+    best = ours[0]  # of those that finished, the best one is the first
+    how = "correctly" if comparison.has_ground_truth else "surely"
+    whose = "COLMAP" if colmap.name == SIFT_COLMAP else "COLMAP's SIFT with our mapper"
+    difference = best.trusted.mean - colmap.trusted.mean
+    times = _times(best.total_s, colmap.total_s)
+    more = number_text(abs(difference), 1)
+    photographs = "photograph" if more == "1" else "photographs"
+    if difference >= MIN_DIFFERENCE:
+        text = f"{best.name} places {more} {photographs} more {how} than {whose}"
+        return f"{text}, in {times}."
+    if difference <= -MIN_DIFFERENCE:
+        text = f"{whose} does better here: it places {more} {photographs} more {how}"
+        return f"{text}; {best.name} takes {times}."
+    num_trusted = number_text(colmap.trusted.mean, 1)
+    return (
+        f"{whose} does as well here: {num_trusted} placed {how} by it and by {best.name}, "
+        f"which takes {times}."
+    )
+
+
+def _times(seconds: float, others_s: float) -> str:
+    """Say how long something takes, compared with another one.
+
+    >>> _times(21.0, 10.0), _times(10.0, 10.4), _times(1.0, 0.0)
+    ('2.1 times the time', 'about the same time', 'about the same time')
+    """
+    if not others_s or 1.0 / SAME_TIME <= seconds / others_s <= SAME_TIME:
+        return "about the same time"
+    return f"{seconds / others_s:.1f} times the time"
 
 
 def headline(comparison: Comparison) -> list[str]:
@@ -158,6 +200,9 @@ def summary(comparison: Comparison) -> str:
     lines = [aligned(rows), "", *headline(comparison)]
     for paragraph in notes(comparison):
         lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
+    ending = conclusion(comparison)
+    if ending:
+        lines += ["", *textwrap.wrap(ending, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
 
 
@@ -196,6 +241,7 @@ def to_json(comparison: Comparison) -> str:
         methods[values.pop("name")] = values
     content = {
         "verdict": verdict(comparison),
+        "conclusion": conclusion(comparison),
         "images_total": len(comparison.image_names),
         "only_registered_by": comparison.only_registered_by,
         "registered_by_none": comparison.registered_by_none,

@@ -60,13 +60,14 @@ def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
 def main() -> None:
     """Run the method that the parent sends; its progress goes to stdout, all else to stderr."""
     end_with(int(sys.argv[1]))
-    shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    # By lines: else they come all at once, when the process ends
+    shown = os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8")
     os.dup2(2, 1)  # what others print
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
     run, title = pickle.load(sys.stdin.buffer)  # noqa: S301 (from the parent)
     run.progress = Progress(shown, 1, title)
     try:
-        with run.workspace.locked():
+        with run.workspace.locked(), run.progress.never_silent():
             run.run()
     except AffrectError as error:
         run.keep(failed=str(error))

@@ -107,6 +107,16 @@ def advice(
     return tuple(found)
 
 
+def command_with_tie_points(context: Context) -> str:
+    """Return the command of a run with tie points that were marked on its page."""
+    return _again(context, "--tie-points", "tie-points.csv")
+
+
+def command_with_masks(context: Context) -> str:
+    """Return a command that runs anew with masks that were painted on the page of a run."""
+    return _anew(context, "--mask-path", "masks")
+
+
 def _of_fitting_focal(case: _Case) -> list[Advice]:
     contradicted = [
         doubt for doubt in case.doubts if doubt.code == "focal_contradicted"

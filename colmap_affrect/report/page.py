@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,9 @@ class Page:
     image_path: Path | None  # their folder; without it there are no thumbnails
     views: Sequence[View3D]  # models, which the script draws
     inlier_matrix: str = ""  # base64: (N, N) uint16 numbers of inliers
-    # What the tool for tie points begins with
-    tie_points: Mapping[str, Any] | None = None
-    can_mark: bool = False  # whether the page has that tool
+    # What more the scripts read, and their files
+    script_data: Mapping[str, Any] = field(default_factory=dict)
+    scripts: Sequence[str] = ("page.js", "geometry.js", "viewer.js")
 
 
 def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
@@ -81,13 +81,12 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
     )
     environment.tests["contains"] = lambda values, value: value in values
     digests = {}  # of scripts, as the Content-Security-Policy of the page wants them
-    for name in ("page.js", "tie_points.js") if page.can_mark else ("page.js",):
+    for name in page.scripts:
         script = (TEMPLATES / name).read_text(encoding="utf-8")
         digests[script] = base64_text(hashlib.sha256(script.encode()).digest())
     content = {
         **page.content,
         "inlier_matrix": page.inlier_matrix,
-        "can_mark": page.can_mark,
         "inlier_colors": INLIER_COLORS,
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
         "scripts": digests,
@@ -108,8 +107,8 @@ def _script_data(page: Page) -> dict[str, Any]:
         "starts": list(INLIER_COLORS),
         "colors": list(INLIER_COLORS.values()),
         "matrix": page.inlier_matrix,
-        "tie_points": page.tie_points,
         "views": [view.script_data(index) for view in page.views],
+        **page.script_data,
     }
 
 

@@ -3,6 +3,7 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
+
+NUM_KEPT = 200  # photographs whose features are kept in memory
 
 
 class MatchKind(IntEnum):
@@ -62,6 +65,7 @@ class PairReader:
         self.agreement = agreements(
             self.graph, self.model
         )  # share of inliers, by verified pair
+        self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
@@ -118,16 +122,21 @@ class PairReader:
         """
         kinds = np.full(len(matches), MatchKind.OWN)
         for side, name in enumerate(names):
-            ids = self.run.features.read(name).rectification_ids if self.run else ()
-            if not self.run or len(ids) != len(
-                keypoints[side]
-            ):  # another program changed it
+            stored = self._stored_kinds(name)
+            if len(stored) != len(keypoints[side]):  # another program changed it
                 return np.full(len(matches), MatchKind.FOREIGN)
-            feature_kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
-            for level, rows in self.run.features.level_ranges(name).items():
-                if not self.run.extraction.levels[level].features.has_shapes:
-                    feature_kinds[rows.start : rows.stop] = MatchKind.LEARNED
-            kinds = np.maximum(kinds, feature_kinds[matches[:, side]])
+            kinds = np.maximum(kinds, stored[matches[:, side]])
+        return kinds
+
+    def _read_stored_kinds(self, name: str) -> Indices:
+        """Return the kinds of the features of a photograph; none where the run has none."""
+        if not self.run:
+            return np.empty(0, dtype=np.int64)
+        ids = self.run.features.read(name).rectification_ids
+        kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
+        for level, rows in self.run.features.level_ranges(name).items():
+            if not self.run.extraction.levels[level].features.has_shapes:
+                kinds[rows.start : rows.stop] = MatchKind.LEARNED
         return kinds
 
     def _tie_points(self, names: Pair, keypoints: list[Array]) -> list[Array]:

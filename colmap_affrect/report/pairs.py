@@ -65,7 +65,7 @@ LEGEND = {LABELS[kind]: COLORS[kind] for kind in MatchKind}
 
 # Sizes and numbers were chosen by eye.
 MAX_NUM_LINES = 200  # of inliers, and as many of rejected matches
-SIDE_PX = 450  # longer side of photographs in a page
+SIDE_PX = 380  # longer side of photographs in a page
 SHEET_SIDE_PX = 900  # of photographs in a picture of its own
 POINT_RADIUS_PX = 3  # of a disk at the end of a line
 LEGEND_BAR_PX = (150, 4)  # (width, height) of the bar of a colour
@@ -177,12 +177,16 @@ def _legend(kinds: Indices) -> ColorImage:
 
 
 def draw_pairs_to_check(
-    context: Context, report: ReconstructionReport, num_inliers: Mapping[Pair, int]
+    context: Context,
+    reader: PairReader,
+    report: ReconstructionReport,
+    num_inliers: Mapping[Pair, int],
 ) -> list[PairPicture]:
     """Draw the pairs of a run that a person should look at.
 
     Args:
         context: of the run.
+        reader: of its pairs.
         report: of the run.
         num_inliers: of the verified pairs that may be used.
 
@@ -192,7 +196,6 @@ def draw_pairs_to_check(
     image_path = context.workspace.photographs()
     if not image_path:
         return []
-    reader = PairReader(context.graph, context)
     chosen = pairs_to_check(
         report,
         num_inliers,

@@ -12,10 +12,13 @@ from colmap_affrect.images.reading import encode_jpeg, read_color
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
 
-# Chosen so that a page of any number of photographs has a few MB, which can be sent by mail.
+# Chosen so that a page of 40 photographs has at most 3 MB, and of 1000 a few more.
 JPEG_QUALITY = 70
-MAX_TOTAL_PX = 12_000_000  # of all thumbnails of a page
+MAX_TOTAL_PX = (
+    6_000_000  # of all thumbnails of a page, as long as these stay large enough
+)
 MAX_SIDE_PX = 640  # longer side of a thumbnail
+MIN_SIDE_PX = 126  # of a thumbnail in which one recognises the photograph
 MAX_NUM_THUMBNAILS = 1000
 ASPECT_RATIO = 4 / 3  # of usual photographs
 
@@ -56,7 +59,8 @@ def thumbnails(
     """
     shown = names[:MAX_NUM_THUMBNAILS]
     area_px = MAX_TOTAL_PX / max(1, len(names))
-    side_px = int(min(MAX_SIDE_PX, (ASPECT_RATIO * area_px) ** 0.5))
+    fitting_px = int((ASPECT_RATIO * area_px) ** 0.5)
+    side_px = max(MIN_SIDE_PX, min(MAX_SIDE_PX, fitting_px))
 
     def picture(name: str) -> Picture | None:
         try:

@@ -11,6 +11,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.errors import such_as
+from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.camera_notes import camera_notes, merge_shared_cameras
@@ -19,28 +20,32 @@ from colmap_affrect.project.report import (
     MAX_LINES,
     SOURCES,
     ModelSummary,
-    ReconstructionReport,
     by_story,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, Page, write_page
+from colmap_affrect.report.pair_lines import PairLines
 from colmap_affrect.report.pairs import LEGEND, PairPicture
+from colmap_affrect.report.photographs import (
+    PhotographReport,
+    Quality,
+    facts_of,
+    quality_of,
+)
 from colmap_affrect.report.pictures import base64_text
-from colmap_affrect.report.scene import View3D, read_view
-
-KINDS = {
-    "tracks": "registered by common points",
-    "bridged": "bridged by one pair",
-    "existing": "was in the model",
-    "doubtful": "doubtful",
-}
-"""How cameras came in; each has a colour of this name."""
+from colmap_affrect.report.run_report import RunReport, contradiction_text
+from colmap_affrect.report.scene import MAX_NUM_OBSERVATIONS, View3D, read_view
+from colmap_affrect.report.verdict import QUALITIES, SIGNS, verdict_of
 
 # More would make a page too large to be read or sent.
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
+NUM_KEY_LETTERS = 16  # of the digests by which a browser keeps marks and masks
+
+SCRIPTS = ("page.js", "geometry.js", "pairs.js", "viewer.js")
+TOOL_SCRIPTS = ("tie_points.js", "masks.js")
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,7 @@ class Card:
     """A photograph on the contact sheet."""
 
     name: str
-    kind: str  # one of ``KINDS``, or ``missing``
+    kind: Quality
     text: str
     groups: tuple[str, ...]  # what the buttons above the sheet choose by
 
@@ -62,14 +67,17 @@ class RunContent:
     image_path: Path | None = None  # folder of the photographs, if known
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
+    pair_lines: PairLines = field(default_factory=PairLines)
     cameras: Mapping[str, pycolmap.Camera] = field(
         default_factory=dict
     )  # in the database
+    marks_command: str = ""  # maps again with marks that are saved
+    masks_command: str = ""  # runs anew with masks that are saved
 
 
 def write_run_page(
     workspace: Workspace,
-    report: ReconstructionReport,
+    report: RunReport,
     content: RunContent,
     progress: Progress = SILENT,
 ) -> Path:
@@ -88,99 +96,127 @@ def write_run_page(
         WorkspaceError: the page cannot be written.
     """
     names = content.names
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
-    views = _views(workspace, report)
     known = set(names)
     num_inliers = {
         pair: count
         for pair, count in content.num_inliers.items()
         if known.issuperset(pair)
     }
-    cameras = content.cameras
+    photographs = _known_photographs(report, names)
+    views = _views(workspace, report)
+    can_mark = len(content.cameras.keys() & known) > 1
     page = Page(
         template=TEMPLATES / "run.html",
         content={
-            "report": report,
-            "model": model,
-            "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
-            "doubts": _doubts(report, model),
-            "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
-            "max_num_lines": MAX_LINES,
+            **_content(report, content, photographs),
             "views": views or [read_view(None, {})],
-            "kinds": _kinds_legend(views),
-            "cards": [_card(name, report, model) for name in names],
             "num_pairs": len(num_inliers),
-            "pairs_to_check": content.pairs_to_check,
-            "line_colors": LEGEND,
-            **_cameras(report, names),
-            "lines": list(report.lines.items())[:MAX_NUM_CAMERAS],
-            "num_lines_known": sum(one.is_known for one in report.lines.values()),
-            "wants_marks": bool(content.marks)
-            or len(model.registered_names) < len(names),
-            "residuals": [
-                f"{one.point} in {one.image}: {one.error_px:.1f} px"
-                for one in model.tie_points
-            ],
+            "can_mark": can_mark,
         },
         names=names,
         image_path=content.image_path,
         views=views,
         inlier_matrix=inlier_matrix(names, num_inliers),
-        tie_points=_tie_points(model, names, content.marks, cameras),
-        can_mark=len(cameras.keys() & known) > 1,
+        script_data={
+            **_tools(report, content),
+            "pair_lines": content.pair_lines.script_data(),
+            "line_colors": list(LEGEND.values()),
+            "facts": [
+                facts_of(photographs[name], report.lines.get(name)) for name in names
+            ],
+        },
+        scripts=SCRIPTS + TOOL_SCRIPTS if can_mark else SCRIPTS,
     )
     return write_page(workspace.page, page, progress)
 
 
-def _views(workspace: Workspace, report: ReconstructionReport) -> list[View3D]:
-    """Read the largest models, with the kinds of their cameras."""
-    views = []
-    for number, model in enumerate(report.models[:MAX_NUM_MODELS]):
-        kinds = {
-            name: _card(name, report, model).kind for name in model.registered_names
-        }
-        views.append(read_view(workspace.sparse / str(number), kinds))
-    return views
+def _known_photographs(
+    report: RunReport, names: Sequence[str]
+) -> dict[str, PhotographReport]:
+    """Return what is known of all photographs, by the models alone where nothing else is."""
+    found = dict(report.photographs)
+    for name in names:
+        if name not in found:
+            found[name] = PhotographReport("missing")
+    return found
 
 
-def _kinds_legend(views: Sequence[View3D]) -> dict[str, str]:
-    """Return a text for each kind of cameras that there is."""
-    counts = Counter[str]()
-    for view in views:
-        counts.update(view.kinds.values())
+def _content(
+    report: RunReport,
+    content: RunContent,
+    photographs: Mapping[str, PhotographReport],
+) -> dict[str, Any]:
+    """Return the variables of the template."""
+    names = content.names
+    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    verdict = verdict_of(report, names, photographs)
     return {
-        kind: f"{text} ({counts[kind]})" for kind, text in KINDS.items() if counts[kind]
+        "report": report,
+        "model": model,
+        "verdict": verdict,
+        "qualities": QUALITIES,
+        "signs": SIGNS,
+        "photographs": [(name, photographs[name]) for name in names[:MAX_NUM_CAMERAS]],
+        "contradictions": [
+            contradiction_text(one) for one in report.focal_contradictions
+        ],
+        "doubts": _doubts(report, model),
+        "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
+        "max_num_lines": MAX_LINES,
+        "cards": [_card(name, report, photographs[name]) for name in names],
+        "pairs_to_check": content.pairs_to_check,
+        "marks_command": content.marks_command,
+        "masks_command": content.masks_command,
+        "line_colors": LEGEND,
+        **_cameras(report, names),
+        "lines": list(report.lines.items())[:MAX_NUM_CAMERAS],
+        "num_lines_known": sum(one.is_known for one in report.lines.values()),
+        "wants_marks": bool(content.marks) or "missing" in verdict.counts,
+        "residuals": [
+            f"{one.point} in {one.image}: {one.error_px:.1f} px"
+            for one in model.tie_points
+        ],
     }
 
 
-def _card(name: str, report: ReconstructionReport, model: ModelSummary) -> Card:
+def _views(workspace: Workspace, report: RunReport) -> list[View3D]:
+    """Read the largest models, with the classes of their photographs as colours."""
+    views = []
+    shown = report.models[:MAX_NUM_MODELS]
+    for number, model in enumerate(shown):
+        kinds = {name: quality_of(name, model) for name in model.registered_names}
+        path = workspace.sparse / str(number)
+        views.append(read_view(path, kinds, MAX_NUM_OBSERVATIONS // len(shown)))
+    return views
+
+
+def _card(name: str, report: RunReport, photograph: PhotographReport) -> Card:
     """Return what became of a photograph."""
-    if name not in model.registered_names:
+    kind = photograph.quality
+    if photograph.model is None:
         why = report.unregistered.get(name)
         text = why.text() if why else FATES["not_registered"]
         if name in report.failures:
             text += f": {report.failures[name]}"
         return Card(name, "missing", text, ("all", "missing"))
-    kind = "tracks"
-    text = "registered"
+    model = report.models[photograph.model]
+    texts = [str(kind)]
+    if photograph.probability is not None:
+        texts[0] += f": {probability_text(photograph.probability)} probable"
+    groups = ["all", str(kind)]
+    if photograph.model:
+        texts.append(f"in another model, sparse/{photograph.model}")
     if name in model.bridges:
-        kind = "bridged"
-        text = model.bridges[name].text()
+        texts.append(model.bridges[name].text())
+        groups.append("bridged")
     if name in report.extended:
-        kind = "existing"
-        text = KINDS["existing"]
-    groups = ["all", kind]
+        texts.append("was in the model")
     if name in report.added:
         groups.append("added")
-    if name in model.probabilities:
-        text += f", right with a probability of {probability_text(model.probabilities[name])}"
-    if name in model.unsure:
-        text += "; not sure" + _own_reason(name, model.unsure)
-    if name in model.doubtful:
-        kind = "doubtful"
-        text += "; doubtful" + _own_reason(name, model.doubtful)
-        groups.append("doubtful")
-    return Card(name, kind, text, tuple(groups))
+    doubts = {**model.unsure, **model.doubtful}
+    if name in doubts:
+        texts.append(_own_reason(name, doubts))
+    return Card(name, kind, "; ".join(filter(None, texts)), tuple(groups))
 
 
 def _own_reason(name: str, doubts: Mapping[str, tuple[Doubt, ...]]) -> str:
@@ -189,10 +225,10 @@ def _own_reason(name: str, doubts: Mapping[str, tuple[Doubt, ...]]) -> str:
     Such a reason is above the sheet only.
     """
     reasons = doubts[name]
-    return f": {text_of(reasons)}" if list(doubts.values()).count(reasons) == 1 else ""
+    return text_of(reasons) if list(doubts.values()).count(reasons) == 1 else ""
 
 
-def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
+def _doubts(report: RunReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, or why there is no model and what became of photographs."""
     if report.models:
         unsure = [f"not sure: {line}" for line in by_story(texts_of(model.unsure))]
@@ -202,49 +238,46 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
 
 
-def _cameras(report: ReconstructionReport, names: Sequence[str]) -> dict[str, Any]:
+def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:
     """Return the first cameras, each with its photographs, and the sources of all focal lengths."""
     numbers = {name: number for number, name in enumerate(names, 1)}
     rows = []
-    for camera in merge_shared_cameras(report.cameras)[:MAX_NUM_CAMERAS]:
+    mapped = merge_shared_cameras(report.cameras)
+    for camera in mapped[:MAX_NUM_CAMERAS]:
         known = [name for name in camera["names"] if name in numbers]
         photographs = such_as(f"{numbers[name]} {name}" for name in known)
         rows.append((camera, photographs))
     return {
         "cameras": rows,
+        "is_cut": len(mapped) > MAX_NUM_CAMERAS,
         "source_counts": Counter(one["source"] for one in report.cameras).most_common(),
         "source_texts": SOURCES,
         "camera_notes": camera_notes(report.cameras),
     }
 
 
-def _tie_points(
-    model: ModelSummary,
-    names: Sequence[str],
-    marks: Marks,
-    cameras: Mapping[str, pycolmap.Camera],
-) -> dict[str, Any]:
-    """Return what the tool for tie points begins with.
-
-    Args:
-        model: has the residuals of tie points.
-        names: of all photographs.
-        marks: (2,) px by point and photograph.
-        cameras: of the photographs in the database, which have their sizes.
-    """
+def _tools(report: RunReport, content: RunContent) -> dict[str, Any]:
+    """Return what the tools for tie points and masks begin with."""
+    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    names = content.names
     index = {name: number for number, name in enumerate(names)}
     errors_px = {(one.point, one.image): one.error_px for one in model.tie_points}
     rows = []
-    for point, points in marks.items():
+    for point, points in content.marks.items():
         for name, (x, y) in points.items():
             rows.append(
                 [point, index[name], float(x), float(y), errors_px.get((point, name))]
             )
-    photographs = []
+    sizes = []
     for name in names:
-        camera = cameras.get(name)
-        photographs.append([name, camera.width, camera.height] if camera else None)
-    return {"photographs": photographs, "marks": rows}
+        camera = content.cameras.get(name)
+        sizes.append([name, camera.width, camera.height] if camera else None)
+    # What a browser keeps belongs to these photographs, marks also to those given before
+    key = digest_of([sizes, rows])[:NUM_KEY_LETTERS]
+    return {
+        "tie_points": {"photographs": sizes, "marks": rows, "key": key},
+        "masks_key": digest_of(sizes)[:NUM_KEY_LETTERS],
+    }
 
 
 def inlier_matrix(names: Sequence[str], num_inliers: Mapping[Pair, int]) -> str:

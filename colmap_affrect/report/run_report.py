@@ -2,20 +2,31 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
-from colmap_affrect.errors import NoModelError, OptionError, shown
+from colmap_affrect.errors import NoModelError, OptionError, shown, such_as
+from colmap_affrect.mappers.camera_priors import (
+    FocalContradiction,
+    focal_contradictions,
+)
 from colmap_affrect.options import documented
 from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.reasons import text_of
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import (
+    MAX_LINES,
+    SOURCES,
+    ModelSummary,
+    ReconstructionReport,
+)
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.photographs import PhotographReport
+from colmap_affrect.session.context import Context
 
 MAX_ROWS = 200  # photographs in the table of a notebook; report.json has all
 
@@ -27,6 +38,10 @@ class RunReport(ReconstructionReport):
 
     output_path: Path
     """Folder of all results."""
+    photographs: dict[str, PhotographReport] = field(default_factory=dict)
+    """Figures of each photograph, by name."""
+    focal_contradictions: tuple[FocalContradiction, ...] = ()
+    """Focal lengths of EXIF or the user that straight lines contradict."""
 
     @property
     def page_path(self) -> Path | None:
@@ -60,6 +75,13 @@ class RunReport(ReconstructionReport):
         content = super().to_mapping()
         del content["output_path"]  # a folder may be moved
         return content
+
+    def summary(self, *, with_warnings: bool = True) -> str:
+        """Return one screen of text."""
+        lines = [super().summary(with_warnings=with_warnings)]
+        for one in self.focal_contradictions[:MAX_LINES]:
+            lines.append(f"lines       {contradiction_text(one)}")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         registered = f"{len(self.registered_names)} of {self.images_total} images"
@@ -185,6 +207,40 @@ def lines_of_report(
         if lines is not None:
             found[name] = line_report(lines, sizes[name])
     return found
+
+
+def contradictions_of_report(context: Context) -> tuple[FocalContradiction, ...]:
+    """Return the focal lengths of EXIF and of the user that stored straight lines contradict."""
+    workspace = context.workspace
+    if workspace.is_foreign:
+        return ()
+    lines = {}
+    sizes = context.features.image_sizes()
+    for name in context.graph.ids:
+        stored = context.features.lines(name) if name in sizes else None
+        of_lines = stored.camera() if stored is not None else None
+        if of_lines is not None:
+            lines[name] = of_lines
+    cameras = {}
+    for camera in context.graph.cameras.values():
+        cameras[camera.camera_id] = camera
+    records = read_camera_records(workspace.cameras)
+    return tuple(focal_contradictions(cameras.values(), records, lines))
+
+
+def contradiction_text(found: FocalContradiction) -> str:
+    """Say what lines contradict, and what helps."""
+    is_given = found.source == "given"
+    remedy = (
+        "--cameras-path takes another one"
+        if is_given
+        else "--ignore-exif leaves it out"
+    )
+    source = "given" if is_given else SOURCES.get(found.source, found.source)
+    return (
+        f"{such_as(found.names)}: the focal length {source} is {found.said_px:,.0f} px, straight "
+        f"lines tell {found.lines_px:,.0f} px +-{found.lines_sigma:.0%}; {remedy}"
+    )
 
 
 def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:

@@ -1,6 +1,6 @@
 """What a run ends with: ``report.json`` and ``report.html``, from the models that mapping made."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,19 +8,29 @@ from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.escalation.escalate import matched_again
 from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.report import (
     ModelSummary,
     StageReport,
     installed_versions,
     sum_by_stage,
 )
-from colmap_affrect.report.advice import advice
+from colmap_affrect.report.advice import (
+    advice,
+    command_with_masks,
+    command_with_tie_points,
+)
+from colmap_affrect.report.pair_lines import lines_of_pairs
+from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import draw_pairs_to_check
+from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.run_page import RunContent, write_run_page
 from colmap_affrect.report.run_report import (
     RunReport,
     cameras_of_report,
+    contradictions_of_report,
     lines_of_report,
 )
 from colmap_affrect.session.context import Context
@@ -56,6 +66,10 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     by_hand = context.by_hand
     pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
     missing = unregistered(context, result.names, result.models, pair_inliers)
+    cameras = cameras_of_report(workspace, result.models, result.extended)
+    lines: dict[str, LineReport] = {}
+    if not workspace.is_foreign:
+        lines = lines_of_report(context.features, result.names)
     again = matched_again(context)
     report = RunReport(
         output_path=workspace.path,
@@ -68,7 +82,12 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         preset=result.options.preset_name,
         verification=context.verification.to_mapping(),
         mapping=result.options.to_mapping(),
-        cameras=cameras_of_report(workspace, result.models, result.extended),
+        cameras=cameras,
+        lines=lines,
+        photographs=photographs_of_report(
+            workspace, result.names, result.models, cameras, lines
+        ),
+        focal_contradictions=contradictions_of_report(context),
         extended=tuple(result.extended),
         advice=advice(
             context,
@@ -82,24 +101,46 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         effort=again.effort if again.tried or again.untried else "",
         matched_again=again.tried,
         untried=again.untried,
-        **_own_results(context, result.names),
+        **_own_results(context),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
     replace_text(workspace.report, report.to_json())
     if page:
-        content = RunContent(
-            result.names,
-            pair_inliers,
-            workspace.photographs(),
-            result.marks,
-            draw_pairs_to_check(context, report, pair_inliers),
-            context.graph.cameras,
-        )
-        write_run_page(workspace, report, content, context.progress)
+        _write_page(context, result, report, num_inliers=pair_inliers)
     return report
 
 
-def _own_results(context: Context, names: Sequence[str]) -> dict[str, Any]:
+def _write_page(
+    context: Context,
+    result: MappingResult,
+    report: RunReport,
+    num_inliers: Mapping[Pair, int],
+) -> None:
+    """Write ``report.html``.
+
+    Args:
+        context: of the workspace, with its models.
+        result: of mapping.
+        report: of the run.
+        num_inliers: of the verified pairs.
+    """
+    workspace = context.workspace
+    reader = PairReader(context.graph, context)
+    content = RunContent(
+        names=result.names,
+        num_inliers=num_inliers,
+        image_path=workspace.photographs(),
+        marks=result.marks,
+        pairs_to_check=draw_pairs_to_check(context, reader, report, num_inliers),
+        pair_lines=lines_of_pairs(reader, result.names, num_inliers),
+        cameras=context.graph.cameras,
+        marks_command=command_with_tie_points(context),
+        masks_command=command_with_masks(context),
+    )
+    write_run_page(workspace, report, content, context.progress)
+
+
+def _own_results(context: Context) -> dict[str, Any]:
     """Return the fields that differ, or are missing, for the database of another program."""
     workspace = context.workspace
     if workspace.is_foreign:
@@ -108,5 +149,4 @@ def _own_results(context: Context, names: Sequence[str]) -> dict[str, Any]:
         "num_pairs": len(context.listed_pairs()),
         "recipe": workspace.recipe(),
         "guided": guided_counts(context),
-        "lines": lines_of_report(context.features, names),
     }

@@ -14,7 +14,14 @@ from colmap_affrect.comparison.results import (
     PoseScores,
     SeedResult,
 )
-from colmap_affrect.comparison.tables import headline, notes, summary, table, to_json
+from colmap_affrect.comparison.tables import (
+    conclusion,
+    headline,
+    notes,
+    summary,
+    table,
+    to_json,
+)
 
 NAMES = tuple("abcdef")
 FIRST = "Photographs that are registered:"
@@ -124,6 +131,42 @@ def test_what_is_missing_doubtful_or_failed_in_most_seeds_is_told(
     assert notes(comparison(*methods)) == expected
 
 
+SLOW = replace(method("default", NAMES), wall_s={"extract": 17.0})
+
+
+@pytest.mark.parametrize(
+    ("methods", "expected"),
+    [
+        (
+            [COLMAP, SLOW],
+            "default places 4 photographs more surely than COLMAP, in 2.1 times the time.",
+        ),
+        (
+            [SIFT, method("default", "abd")],
+            "COLMAP's SIFT with our mapper does as well here: 3 placed surely by it and by "
+            "default, which takes about the same time.",
+        ),
+        (
+            [COLMAP, SIFT, method("default", "a")],
+            "COLMAP does better here: it places 1 photograph more surely; default takes about "
+            "the same time.",
+        ),
+        (
+            [method("sift-colmap", "abc", correct="ab"), method("default", "abcd", correct="abd")],
+            "default places 1 photograph more correctly than COLMAP, in about the same time.",
+        ),
+        ([SIFT], ""),
+        ([DEFAULT], ""),
+    ],
+)  # fmt: skip
+def test_a_comparison_ends_in_a_sentence_that_answers_it(
+    methods: Methods, expected: str
+):
+    compared = comparison(*methods)
+    assert conclusion(compared) == expected
+    assert summary(compared).replace("\n", " ").endswith(expected)
+
+
 def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
     without = replace(method("none", ""), peak_memory_bytes=10**8)
     columns = table(comparison(without, SIFT, method("default", "abcd", "abcde")))
@@ -145,7 +188,10 @@ def test_json_and_summary_say_the_same():
         SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED
     )
     values = json.loads(to_json(compared))
-    assert values["verdict"] == [*headline(compared), *notes(compared)]
+    ending = conclusion(compared)
+    assert ending
+    assert values["conclusion"] == ending
+    assert values["verdict"] == [*headline(compared), *notes(compared), ending]
     assert (values["images_total"], values["registered_by_none"]) == (6, ["e", "f"])
     default = values["methods"]["default"]
     assert default["registered"] == {"mean": 4.5, "min": 4.0, "max": 5.0}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -70,21 +73,135 @@ def browser(
     assert running.run(OUTSIDE) == []
 
 
-def test_a_click_on_a_camera_shows_its_photograph(browser: Browser) -> None:
+SELECTED = "return document.querySelector('#look select').value"
+SEEN = """return [...document.querySelectorAll('#model .seen .chip')]
+    .map((chip) => chip.textContent)"""
+FACTS = "return document.querySelector('#photo .facts').innerText"
+MIDDLE = """
+    const [x, y] = arguments;
+    const canvas = document.querySelector("canvas[data-model]");
+    const {width, height} = canvas;
+    const copy = new OffscreenCanvas(width, height).getContext("2d", {willReadFrequently: true});
+    copy.drawImage(canvas, 0, 0);
+    const [red, green, blue] = copy.getImageData(x * width, y * height, 1, 1).data;
+    return [red, green, blue]"""
+
+
+def test_a_click_on_a_camera_looks_through_it_and_a_key_leaves_it(
+    browser: Browser,
+) -> None:
     browser.run("document.querySelector('canvas').scrollIntoView({block: 'center'})")
-    assert not browser.run(DIALOG)
-    browser.press(*browser.run(PLACE_OF_CAMERA, "3 c.png: bridged by"))
-    assert browser.run(DIALOG)
-    same = """return document.querySelector("#photo img").src ===
-        document.querySelectorAll("#sheet img")[2].src"""
-    assert browser.run(same)
-    assert "12 of 15 depths" in browser.run(
-        "return document.getElementById('photo').innerText"
+    before = until_drawn(browser)
+    browser.press(*browser.run(PLACE_OF_CAMERA, "3 c.png: "))
+    assert browser.run(SELECTED) == "2"
+    inside = until_changed(browser, before)
+    readout = browser.run(
+        "return document.querySelector('#model .readout').textContent"
     )
-    browser.click("#photo [data-step='1']")
-    assert "d.png" in browser.run("return document.getElementById('photo').innerText")
-    browser.click("#photo [data-step='0']")
+    assert readout.startswith("Through 3 c.png. ~ unsure: 70% probable")
+    browser.key("PageDown")
+    assert browser.run(SELECTED) == "3"
+    until_changed(browser, inside)
+    browser.key("Escape")
+    assert browser.run(SELECTED) == ""
+
+
+def test_a_point_says_who_sees_it_and_where(browser: Browser) -> None:
+    """Space takes the point in the middle; a click on a piece goes there."""
+    browser.run("page.lookThrough(0)")
+    browser.run("document.querySelector('canvas').scrollIntoView({block: 'center'})")
+    browser.key(" ")
+    seen = browser.run(SEEN)
+    assert len(seen) >= 2
+    assert seen[0].startswith("1 <img src=x")
+    text = browser.run(
+        "return document.querySelector('#model .seen .note').textContent"
+    )
+    assert text.startswith(f"This point is seen by {len(seen)} photographs")
+    browser.run("document.querySelectorAll('#model .seen .chip')[1].click()")
+    assert browser.run(SELECTED) == str(int(seen[1].split()[0]) - 1)
+
+
+def test_points_lie_on_what_they_are_in_the_photograph(
+    browser: Browser,
+) -> None:
+    """Where a camera sees a point, its view draws it in the colour of points that it sees."""
+    browser.run("page.lookThrough(0)")
+    before = until_drawn(browser)
+    browser.key("+")
+    until_changed(browser, before)
+    browser.key("-")
+    expected = browser.run("""
+        const {look} = page.data.views[0].cameras[0];
+        const view = page.data.views[0];
+        const bytes = page.bytes(view.tracks).buffer;
+        const counts = new Uint16Array(bytes, 0, view.count);
+        const total = counts.reduce((sum, count) => sum + count, 0);
+        const seers = new Uint16Array(bytes, 2 * view.count, total);
+        const at = new Uint16Array(bytes, 2 * (view.count + total), 2 * total);
+        const row = seers.indexOf(0);
+        const canvas = document.querySelector("canvas[data-model]");
+        const {width, height} = canvas;
+        const scale = Math.min(width / look.size[0], height / look.size[1]);
+        return [0.5 + (at[2 * row] / 65535 - 0.5) * look.size[0] * scale / width,
+                0.5 + (at[2 * row + 1] / 65535 - 0.5) * look.size[1] * scale / height]""")
+    for _ in range(50):
+        red, green, blue = browser.run(MIDDLE, *expected)
+        if [red, green, blue] == [255, 224, 0]:
+            break
+        time.sleep(0.02)
+    assert [red, green, blue] == [255, 224, 0]
+
+
+def test_the_dialog_has_the_figures_of_a_photograph(browser: Browser) -> None:
+    browser.click("header [data-open='1']")
+    facts = browser.run(FACTS)
+    for title in ("Points", "Mean residual", "Neighbours", "Focal length"):
+        assert title in facts
+    assert "200 px at the start, from EXIF" in facts
+    browser.click("#photo [data-through]")
     assert not browser.run(DIALOG)
+    assert browser.run(SELECTED) == "1"
+
+
+def test_a_click_into_the_matrix_draws_the_pair(browser: Browser) -> None:
+    assert browser.run("return document.getElementById('pair').hidden")
+    place = browser.run("""const matrix = document.querySelector("[data-matrix]");
+        matrix.scrollIntoView({block: "center"});
+        const at = matrix.querySelector(".ground").getBoundingClientRect();
+        return [at.left + 2.5 * at.width / 6, at.top + 0.5 * at.height / 6]""")
+    browser.press(*place)
+    text = browser.run("return document.getElementById('pair').innerText")
+    assert "1 <img src=x onerror=alert(1)>.png and 3 c.png" in text
+    assert "inliers" in text
+    assert "--reject-pair '<img src=x onerror=alert(1)>.png,c.png'" in text
+    size = (
+        "const c = document.querySelector('#pair canvas'); return [c.width, c.height]"
+    )
+    for _ in range(50):
+        width, height = browser.run(size)
+        if width > 300:
+            break
+        time.sleep(0.02)
+    assert 0 < height < width
+    lines = browser.run("""const canvas = document.querySelector("#pair canvas");
+        const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
+        copy.drawImage(canvas, 0, 0);
+        const pixels = copy.getImageData(0, 0, canvas.width, canvas.height).data;
+        let count = 0;
+        for (let at = 0; at < pixels.length; at += 4) {
+          count += Math.abs(pixels[at] - pixels[at + 2]) > 60;
+        }
+        return count""")
+    assert lines > 500
+
+
+def test_photographs_of_a_pair_are_chosen_from_lists_too(browser: Browser) -> None:
+    browser.run("""const list = document.querySelector("#pair-choice [data-side='1']");
+        list.value = "5";
+        list.dispatchEvent(new Event("change"))""")
+    text = browser.run("return document.getElementById('pair').innerText")
+    assert "f.png" in text
 
 
 def test_photographs_open_and_panels_grow_with_one_click(browser: Browser) -> None:
@@ -174,7 +291,7 @@ def test_models_are_chosen_from_a_list_and_seen_beside_each_other(
         "return JSON.parse(document.getElementById('data').textContent).views"
     )
     assert [camera["kind"] for camera in kinds[0]["cameras"]][-1] == "doubtful"
-    assert [camera["kind"] for camera in kinds[1]["cameras"]][-1] == "tracks"
+    assert [camera["kind"] for camera in kinds[1]["cameras"]][-1] == "unsure"
     assert running.log() == []
 
 
@@ -184,7 +301,25 @@ def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
     browser.command("Emulation.setEmulatedMedia", media="print")
     sides = "return [...document.querySelectorAll('#model .sides img')].map((i) => i.naturalWidth)"
     assert browser.run(sides) == [600] * 3
-    found = "[...document.querySelectorAll('button:not(.photo)')]"
+    found = "[...document.querySelectorAll('button:not(.photo, .chip)')]"
     buttons = f"return {found}.map((b) => b.offsetWidth)"
     assert set(browser.run(buttons)) == {0}
+    browser.command("Emulation.setEmulatedMedia", media="")
+
+
+MAX_NUM_PRINTED = 4  # pages of a run of ten photographs
+PRINTED_PX = 680  # width of A4 without its margins
+
+
+def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
+    browser: Browser,
+) -> None:
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")
+    options = {"preferCSSPageSize": True, "printBackground": True}
+    data = base64.b64decode(browser.command("Page.printToPDF", **options)["data"])
+    assert 1 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", data)) <= MAX_NUM_PRINTED
+    browser.resize(PRINTED_PX)
+    browser.command("Emulation.setEmulatedMedia", media="print")
+    width = "return document.documentElement.scrollWidth"
+    assert browser.run(width) <= PRINTED_PX
     browser.command("Emulation.setEmulatedMedia", media="")

@@ -19,6 +19,7 @@ from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
+from colmap_affrect.session.view_graph import ViewGraph
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,11 @@ def html(folder: Path) -> str:
 
 def test_everything_of_the_report_is_told(html: str) -> None:
     for text in (
-        "<title>4 of 6 photographs registered</title>", "right with a probability of 95%",
+        "<title>2 of 6 photographs are placed surely, 1 unsure, 1 doubtful, 2 not placed</title>",
+        "Next: one camera.", "sparse/0: 4 photographs", "Not placed: 2",
+        "sure: 95% probable", "unsure: 70% probable; bridged by &lt;img src=x",
         "d.png: may be a mirrored copy of &lt;b&gt;.jpg",
-        "right with a probability of 40%; doubtful: may",
+        "doubtful: 40% probable; may be a mirrored",
         ">colmap-affrect run --output-path out-2<", "no verified pair",
         "unreadable: f.png: not a readable image",
         "12 of 15 depths agree, scale +-3.1%",
@@ -44,7 +47,12 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "colmap-affrect show-pair OUT", "model: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html
-    parts = ["Low-confidence images", "What to try next", "<main>"]
+    parts = [
+        "Next: one camera",
+        "Why photographs are not sure",
+        "What to try next",
+        "<main>",
+    ]
     positions = [html.index(part) for part in parts]
     assert positions == sorted(positions)
 
@@ -63,7 +71,7 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
         base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         for script in re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     ]
-    assert len(digests) == 2
+    assert len(digests) == 6
     allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
     assert markup.unescape(policy) == (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
@@ -72,10 +80,23 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
 
 def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
     data = json.loads(html.split('id="data">')[1].split("</script>")[0])
-    assert data["tie_points"] == {
-        "photographs": [[n, *IMAGE_SIZE] for n in NAMES],
-        "marks": [],
-    }
+    assert data["tie_points"]["photographs"] == [[n, *IMAGE_SIZE] for n in NAMES]
+    assert data["tie_points"]["marks"] == []
+
+
+def test_marks_that_a_browser_keeps_are_of_one_run_and_masks_of_its_photographs(
+    folder: Path, html: str, tmp_path: Path
+) -> None:
+    """Marks that were given to a run are in its page, and what was kept before is old."""
+    before = json.loads(html.split('id="data">')[1].split("</script>")[0])
+    cameras = ViewGraph(Workspace(folder / "out").database).cameras
+    marks = {"1": {NAMES[0]: np.array([3.0, 4.0])}}
+    content = RunContent(NAMES, {}, marks=marks, cameras=cameras)
+    page = write_run_page(Workspace(tmp_path), small_report(tmp_path), content)
+    text = page.read_text(encoding="utf-8")
+    after = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert after["tie_points"]["key"] != before["tie_points"]["key"]
+    assert after["masks_key"] == before["masks_key"]
 
 
 def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:
@@ -90,7 +111,7 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(
     assert data["names"][0] == NAMES[0]
     (view,) = data["views"]
     kinds = {camera["index"]: camera["kind"] for camera in view["cameras"]}
-    assert kinds == {0: "tracks", 1: "tracks", 2: "bridged", 3: "doubtful"}
+    assert kinds == {0: "sure", 1: "sure", 2: "unsure", 3: "doubtful"}
     model = pycolmap.Reconstruction(folder / "out" / "sparse" / "0")
     centers = {image.name: image.projection_center() for image in model.images.values()}
     shown = np.array([camera["corners"][:3] for camera in view["cameras"]])
@@ -115,12 +136,12 @@ def test_matrix_of_inliers_is_symmetric_and_not_there_for_many_photographs() -> 
 
 
 @pytest.mark.parametrize(
-    ("num_photographs", "side_px"), [(1, 640), (39, 640), (1000, 126)]
+    ("num_photographs", "side_px"), [(1, 640), (19, 640), (40, 447), (1000, 126)]
 )
 def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
     num_photographs: int, side_px: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All together have at most 12 megapixels, if they are as long as 4 to 3."""
+    """All together have at most 6 megapixels, or 126 px in length each."""
     asked = []
 
     def read(_: Path, size_px: int) -> np.ndarray:
@@ -139,6 +160,7 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
         "models": (),
         "num_verified_pairs": 0,
         "unregistered": dict.fromkeys(NAMES, Missing("no_features")),
+        "photographs": {},
         "cameras": (),
     }
     nothing = type(report)(**{**vars(report), **values})

@@ -21,6 +21,7 @@ from small_scene import NAMES as SCENE_NAMES
 from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.run_page import RunContent, write_run_page
 from colmap_affrect.session.view_graph import ViewGraph
 
@@ -79,6 +80,7 @@ def browser(running: Browser, tmp_path: Path) -> Iterator[Browser]:
     )
     yield running
     assert running.log() == []
+    running.run("localStorage.clear()")
 
 
 def write_block(path: Path, size: tuple[int, int], left: int, top: int) -> None:
@@ -109,6 +111,7 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
         **vars(report),
         "models": (model,),
         "unregistered": dict.fromkeys(names[4:], Missing("not_registered")),
+        "photographs": photographs_of_report(workspace, names, (model,), (), {}),
     }
     cameras = ViewGraph(workspace.database).cameras
     content = RunContent(names, {}, tmp_path / "photographs", marks, cameras=cameras)

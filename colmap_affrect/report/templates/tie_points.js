@@ -1,11 +1,13 @@
 "use strict";
 // Tie points: a person marks the same places in photographs and saves them for --tie-points.
 (() => {
-  const data = JSON.parse(document.getElementById("data").textContent);
+  const { data } = page;
   // [name, width, height] of photographs as stored, or null; [point, photograph, x, y, residual].
-  const { photographs, marks: ofRun } = data.tie_points;
+  const { photographs, marks: ofRun, key } = data.tie_points;
+  const { projector, meeting, epipolarLine } = page.geometry;
   const [DRAG_PX, ARROW_PX, MAX_SCALE] = [6, 40, 32];
-  const [CURRENT_COLOR, COLOR] = ["#ffe000", "#7fe3ff"];
+  const [CURRENT_COLOR, COLOR, EXPECTED_COLOR] = ["#ffe000", "#7fe3ff", "#ff2fd0"];
+  const STORED = `colmap-affrect tie points ${key}`;
   const NUM_HEAD_BYTES = 1 << 18;
   const FILE_NAME = "tie-points.csv";
   const COLUMNS = ["point", "photograph", "x", "y"];
@@ -25,10 +27,65 @@
   let marks = ofRun.map(([point, photo, x, y, error]) => ({ point, photo, x, y, error }));
   let current = unused();
   let isSaved = true;
+  let isKept = true;
   const past = [];
   const points = () => [...new Set(marks.map((mark) => mark.point))];
   const markOf = (point, photo) => marks.find((mark) => mark.point === point && mark.photo === photo);
   const ordered = () => points().flatMap((point) => marks.filter((mark) => mark.point === point));
+
+  // How photographs see the model that they are in, by their numbers.
+  const looks = new Map();
+  data.views.forEach(({ cameras }, model) => {
+    for (const { index, look } of cameras) {
+      if (look && !looks.has(index)) looks.set(index, { ...look, model });
+    }
+  });
+
+  // Marks of a point in photographs of one model, which tell where it is there.
+  function sightsOf(point, model) {
+    const seen = marks.filter((mark) => mark.point === point && looks.get(mark.photo)?.model === model);
+    return seen.map(({ photo, x, y }) => ({ look: looks.get(photo), photo, x, y }));
+  }
+
+  // Where a point should be in a photograph: a place, or lines that it is on. Null: nobody knows.
+  function expected(point, photo) {
+    const look = looks.get(photo);
+    const sights = look ? sightsOf(point, look.model).filter((sight) => sight.photo !== photo) : [];
+    if (!sights.length) return null;
+    const place = sights.length > 1 ? meeting(sights) : null;
+    if (place) {
+      const [x, y] = projector(look)(...place);
+      return Number.isFinite(x) ? { place: { x, y }, lines: [] } : null;
+    }
+    return { place: null, lines: sights.map((sight) => epipolarLine(sight, look)) };
+  }
+
+  // How far a mark is from where all marks of its point say; undefined where they say nothing.
+  function residual({ point, photo, x, y }) {
+    const look = looks.get(photo);
+    const sights = look ? sightsOf(point, look.model) : [];
+    const place = sights.length > 1 ? meeting(sights) : null;
+    if (!place) return undefined;
+    const [seenX, seenY] = projector(look)(...place);
+    return Number.isFinite(seenX) ? Math.hypot(seenX - x, seenY - y) : undefined;
+  }
+
+  // Browsers keep marks over a reload, where they are allowed to.
+  function keep() {
+    try {
+      localStorage.setItem(STORED, JSON.stringify({ marks, current }));
+    } catch {
+      isKept = false;
+    }
+  }
+
+  function kept() {
+    try {
+      return JSON.parse(localStorage.getItem(STORED));
+    } catch {
+      return null;
+    }
+  }
 
   function unused() {
     let number = 1;
@@ -40,6 +97,7 @@
     past.push([marks, current]);
     [marks, isSaved] = [changed, false];
     say(said);
+    keep();
     show();
   }
 
@@ -57,6 +115,7 @@
   function undo() {
     if (!past.length) return;
     [[marks, current], isSaved] = [past.pop(), false];
+    keep();
     show();
   }
 
@@ -135,6 +194,8 @@
       "=": () => this.zoom(1.5),
       "-": () => this.zoom(1 / 1.5),
       whole: () => this.zoom(0),
+      expected: () => this.seek(),
+      e: () => this.seek(),
       " ": () => this.mark(this.middle),
       Delete: () => remove(markOf(current, this.photo)),
       Enter: next,
@@ -191,6 +252,21 @@
       this.pan(this.middle.x - x, this.middle.y - y);
     }
 
+    // Go to where the current point should be, closely enough to mark it.
+    seek() {
+      const should = expected(current, this.photo);
+      const place = should?.place ?? should?.lines[0]?.find(([x, y]) => this.isInside(x, y));
+      if (!place) {
+        say(`Point ${current}: mark it in two photographs of the model, then this one can tell where it is.`);
+        return;
+      }
+      this.look(should.place ?? { x: place[0], y: place[1] });
+    }
+
+    isInside(x, y) {
+      return Math.min(x, y) >= 0 && x <= this.width && y <= this.height;
+    }
+
     onCanvas({ x, y }) {
       return { x: this.left + x * this.scale, y: this.top + y * this.scale };
     }
@@ -198,7 +274,7 @@
     // Mark a place of the canvas, unless it is beside the photograph.
     mark(at) {
       const [x, y] = [(at.x - this.left) / this.scale, (at.y - this.top) / this.scale];
-      if (Math.min(x, y) >= 0 && x <= this.width && y <= this.height) place(this.photo, x, y);
+      if (this.isInside(x, y)) place(this.photo, x, y);
     }
 
     // By px of the original, or the photograph where there is no mark.
@@ -227,8 +303,34 @@
       const box = [this.left, this.top, this.width * this.scale, this.height * this.scale];
       if (this.image) context.drawImage(this.image, ...box);
       const here = marks.filter((mark) => mark.photo === this.photo);
+      this.drawExpected(expected(current, this.photo));
       here.forEach((mark) => this.drawMark(mark));
       this.describe(here);
+    }
+
+    // A ring where the current point should be, or the lines that it is on.
+    drawExpected(should) {
+      if (!should) return;
+      const { context } = this;
+      context.save();
+      context.setLineDash([6, 4]);
+      context.beginPath();
+      if (should.place) {
+        const { x, y } = this.onCanvas(should.place);
+        context.arc(x, y, 12, 0, 2 * Math.PI);
+      }
+      for (const places of should.lines) {
+        places.forEach(([x, y], at) => {
+          const end = this.onCanvas({ x, y });
+          if (at) context.lineTo(end.x, end.y);
+          else context.moveTo(end.x, end.y);
+        });
+      }
+      for (const [color, width] of [["#000000", 4], [EXPECTED_COLOR, 2]]) {
+        Object.assign(context, { strokeStyle: color, lineWidth: width });
+        context.stroke();
+      }
+      context.restore();
     }
 
     drawMark({ point, x, y }) {
@@ -258,11 +360,17 @@
       const isTied = ({ point }) => marks.filter((other) => other.point === point).length > 2;
       const size = this.width / this.image?.width;
       this.readout.textContent = [
-        `Point ${current}: ${mark ? `x ${mark.x.toFixed(2)}, y ${mark.y.toFixed(2)}` : "no mark here"}.`,
+        `Point ${current}: ${mark ? `x ${mark.x.toFixed(2)}, y ${mark.y.toFixed(2)}` : "no mark here"}${this.hint(mark)}.`,
         `Marks: ${here.length}, also in two other photographs: ${here.filter(isTied).length}.`,
         size > 1.01 ? `Open the original to mark precisely: 1 px here is ${size.toFixed(1)} px of it.` : "",
         this.image ? "" : "No picture: open the original.",
       ].join(" ");
+    }
+
+    hint(mark) {
+      const should = expected(current, this.photo);
+      if (mark || !should) return "";
+      return should.place ? ", it should be in the ring" : ", it should be on the line";
     }
 
     listen() {
@@ -328,7 +436,7 @@
     point.firstChild.textContent = mark.point;
     x.textContent = mark.x.toFixed(2);
     y.textContent = mark.y.toFixed(2);
-    error.textContent = mark.error?.toFixed(1) ?? "-";
+    error.textContent = (mark.error ?? residual(mark))?.toFixed(1) ?? "-";
     gone.firstChild.setAttribute("aria-label", `Delete point ${mark.point} in ${name.textContent}`);
     made.classList.toggle("current", mark.point === current);
     made.addEventListener("click", (event) => (gone.contains(event.target) ? remove : goTo)(mark));
@@ -411,7 +519,7 @@
     undo();
   });
   addEventListener("beforeunload", (event) => {
-    if (!isSaved) event.preventDefault();
+    if (!isSaved && !isKept) event.preventDefault();
   });
 
   // First a photograph that is not registered, beside one that is.
@@ -420,5 +528,17 @@
   const shown = [lost, others.find((photo) => !isLost(photo)) ?? others[0]];
   const panes = [];
   section.querySelectorAll("figure").forEach((figure, index) => panes.push(new Pane(figure, shown[index])));
+  const before = kept();
+  if (before) {
+    past.push([marks, current]);
+    ({ marks, current } = before);
+    isSaved = false;
+    say(`Marks from before: ${marks.length}. Undo goes back to those of the run.`);
+  }
   show();
+  page.markIn = (one, two) => {
+    section.querySelector("details").open = true;
+    [one, two].forEach((photo, side) => photographs[photo] && panes[side].load(photo));
+    section.scrollIntoView();
+  };
 })();
