@@ -89,6 +89,7 @@ def mappings_of(
 
 MissingCode = Literal[
     "another_model",
+    "another_group",
     "left_out",
     "unreadable",
     "no_features",
@@ -99,6 +100,7 @@ MissingCode = Literal[
 
 FATES: dict[MissingCode, str] = {
     "another_model": "in another model, sparse/{model}",
+    "another_group": "in another model, sparse/{model}, whose photographs match only each other",
     "left_out": "left out by hand",
     "unreadable": "unreadable",
     "no_features": "no features",
