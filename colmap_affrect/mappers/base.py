@@ -124,8 +124,8 @@ class MappedModel:
     moves: tuple[
         str, ...
     ] = ()  # hypotheses that made the model, in the words of a report
-    finish: Callable[[], None] | None = None
-    """Gives the reconstruction its last points and colours; called once, when images are scored."""
+    finish: Callable[[pycolmap.Reconstruction], None] | None = None
+    """Gives a reconstruction its last points and colours; called once, when images are scored."""
 
 
 class Mapper(Protocol):

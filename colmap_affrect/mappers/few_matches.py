@@ -31,6 +31,7 @@ pair that any wrong matches would not say."""
 MAX_RAW = 30
 """Raw matches of which fewer than 15 inliers can be significant (theory: of more they are not, with
 the usual chance of 3 per cent)."""
+MIN_INLIER_SHARE = 0.8  # of raw matches, which are no few sure ones else (judged)
 MAX_DISAGREEING = 0.1  # share of matches that a third image may contradict (judged)
 
 
@@ -70,9 +71,9 @@ def sure_few_matches(
         if geometry is None:
             continue
         inliers = matches[np.asarray(geometry.inlier_matches, np.int64)[:, 0]]
-        of_chance = significance(
-            geometry, both, (keypoints[0], keypoints[1]), options.max_error_px
-        )
+        if len(inliers) < MIN_INLIER_SHARE * len(matches):
+            continue
+        of_chance = significance(geometry, both, points, options.max_error_px)
         evidence = max(of_chance, 0.0) + closures.log10_evidence(ids, inliers)
         if evidence >= options.min_significance:
             found.append(FewMatches(ids, inliers, geometry))

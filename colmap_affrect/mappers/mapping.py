@@ -27,9 +27,11 @@ from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, PairGraph, graph_
 from colmap_affrect.mappers.reliability import Confidence, score_images
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
+from colmap_affrect.mappers.surroundings import apart
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
 
@@ -174,7 +176,9 @@ def map_database(
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
-        scored = [_without_wrong_images(model, task) for model in found]
+        scored = list[_ScoredModel]()
+        for model in found:
+            scored += _scored_places(model, task)
         min_model_size = 1 if task.extend else mapper.options.min_model_size
         kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
@@ -221,12 +225,32 @@ def _write_models(
     for index, model in enumerate(models):
         path = folder / str(index)
         if model.mapped.finish:
-            model.mapped.finish()
+            model.mapped.finish(model.mapped.reconstruction)
         write_model(model.mapped.reconstruction, path)
         summary = _summary(model, task)
         write_summary(summary, path)
         summaries.append(summary)
     return summaries
+
+
+def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]:
+    """Return a model for each place that a model holds, the largest first, with all scored.
+
+    A model that is extended stays whole, and what a person has tied by hand.
+    """
+    if task.extend or task.tie_points:
+        return [_without_wrong_images(mapped, task)]
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    largest, *others = apart(mapped, graph)
+    scored = _without_wrong_images(largest, task)
+    found = [scored]
+    for other in others:
+        names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
+        for name in names:
+            scored.taken_out[name] = Confidence(0.0, (Doubt("other_surroundings"),))
+        if len(names) > 1:
+            found.append(_without_wrong_images(other, task))
+    return found
 
 
 def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredModel:

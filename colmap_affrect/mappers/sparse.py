@@ -158,7 +158,7 @@ class SparseMapper(IncrementalMapper):
             complete_points(model, graph, native, self.options.noise_px, tie_points)
             _extract_colors(model, task, native)
 
-        return [replace(m, finish=partial(finish, m.reconstruction)) for m in models]
+        return [replace(mapped, finish=finish) for mapped in models]
 
     def _search(
         self,

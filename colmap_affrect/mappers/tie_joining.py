@@ -101,10 +101,10 @@ class TieJoiner:
                 together[first, second] = names
         for ids in sorted(together, key=lambda ids: (-len(together[ids]), ids)):
             cameras = {i: copy.copy(graph.cameras[i]) for i in ids}
-            for camera in cameras.values():
+            for image_id, camera in list(cameras.items()):
                 prior = self.grower.adjuster.priors[camera.camera_id]
                 if prior.is_unknown:
-                    camera.params = _with_focal(camera, prior.starts_px[0]).params
+                    cameras[image_id] = _with_focal(camera, prior.starts_px[0])
             points = []
             for image_id in ids:
                 found = [marks_of[image_id][name] for name in together[ids]]

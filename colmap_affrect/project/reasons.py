@@ -20,6 +20,7 @@ DoubtCode = Literal[
     "tie_points_disagree",
     "bridge_edge",
     "near_others",
+    "other_surroundings",
 ]
 
 SENTENCES: dict[DoubtCode, str] = {
@@ -43,6 +44,10 @@ SENTENCES: dict[DoubtCode, str] = {
     "near_others": (
         "it stands so near to others that the direction between them may be off by "
         "{sigma_deg:.0f} degrees"
+    ),
+    "other_surroundings": (
+        "what matches is a part of what it shows, as a poster in two places is: its surroundings, "
+        "which the model says are the same, do not match"
     ),
 }
 """What to say of each; the numbers in braces are the values of the doubt."""
@@ -90,6 +95,7 @@ def mappings_of(
 MissingCode = Literal[
     "another_model",
     "another_group",
+    "another_place",
     "left_out",
     "unreadable",
     "no_features",
@@ -101,6 +107,7 @@ MissingCode = Literal[
 FATES: dict[MissingCode, str] = {
     "another_model": "in another model, sparse/{model}",
     "another_group": "in another model, sparse/{model}, whose photographs match only each other",
+    "another_place": "in another model, sparse/{model}: {doubts}",
     "left_out": "left out by hand",
     "unreadable": "unreadable",
     "no_features": "no features",

@@ -196,7 +196,7 @@ def unregistered(
     for name in names:
         if name in registered:
             continue
-        why = _why_not_mapped(context, name, models[1:], partners)
+        why = _why_not_mapped(context, name, models, partners)
         reasons[name] = why or _why_lost(name, partners[name], largest)
     return reasons
 
@@ -204,7 +204,7 @@ def unregistered(
 def _why_not_mapped(
     context: Context,
     name: str,
-    others: Sequence[ModelSummary],
+    models: Sequence[ModelSummary],
     partners: Mapping[str, Mapping[str, int]],
 ) -> Missing | None:
     """Return why an image could not be in the largest model; None where it could.
@@ -212,12 +212,15 @@ def _why_not_mapped(
     Args:
         context: of the workspace.
         name: of the image.
-        others: models but the largest one.
+        models: the largest first.
         partners: inliers of verified pairs, by both images.
     """
-    for number, model in enumerate(others, start=1):
+    for number, model in enumerate(models[1:], start=1):
         if name not in model.registered_names:
             continue
+        if name in models[0].taken_out:
+            doubts = models[0].taken_out[name]
+            return Missing("another_place", number, doubts=doubts)
         tied = set[str]()
         for inside in model.registered_names:
             tied |= partners.get(inside, {}).keys()

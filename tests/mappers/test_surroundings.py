@@ -1,0 +1,135 @@
+"""Whether what ties photographs is of one place: a poster in two places keeps models apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_tasks import mapper_of, task_with_given_cameras, write_images
+from numpy.typing import NDArray
+from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.surroundings import places_of
+
+NUM_POINTS = 3000
+HERE = (1, 2, 3)  # images of one place
+THERE = (4, 5, 6)
+
+Bools = NDArray[np.bool_]
+Points = NDArray[np.float64]
+IsShared = Callable[[Points], Bools]
+
+
+def poster(points: Points) -> Bools:
+    """Points of a print that hangs on the wall."""
+    return np.asarray((np.abs(points[:, 0] - 3.5) < 1.2) & (np.abs(points[:, 1]) < 1.0))
+
+
+def everything(points: Points) -> Bools:
+    return np.ones(len(points), bool)
+
+
+def each_tenth(points: Points) -> Bools:
+    """Few matches, all over the wall."""
+    return np.asarray(np.arange(len(points)) % 10 == 0)
+
+
+def scene(path: Path, is_shared: IsShared) -> pycolmap.Reconstruction:
+    """Write a verified database of six images, and return their model.
+
+    Three see the wall of one place and three that of another one; both see what is shared.
+    """
+    random = np.random.default_rng(2)
+    points = wall(random, NUM_POINTS)
+    shared = is_shared(points)
+    of_first = random.random(NUM_POINTS) < 0.5
+    poses = views(6)
+    keypoints = {}
+    rows = {}  # keypoint of each point, by image
+    for image_id, name in enumerate(poses, 1):
+        pixels = project(points, poses[name])
+        own = of_first if image_id in HERE else ~of_first
+        seen = np.flatnonzero(is_inside(pixels) & (own | shared))
+        keypoints[image_id] = pixels[seen]
+        rows[image_id] = {int(point): row for row, point in enumerate(seen)}
+    with open_database(path) as database:
+        camera = pycolmap.Camera(
+            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
+        )
+        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
+        write_images(database, camera, poses)
+        for image_id, pixels in keypoints.items():
+            database.write_keypoints(image_id, pixels.astype(np.float32))
+        for first, second in combinations(rows, 2):
+            common = sorted(rows[first].keys() & rows[second].keys())
+            matches = [(rows[first][point], rows[second][point]) for point in common]
+            if not common:
+                continue
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = np.array(matches, np.uint32)
+            database.write_two_view_geometry(first, second, geometry)
+    model = pycolmap.Reconstruction()
+    model.load(PairGraph.read(path).cache)
+    for image_id, name in enumerate(poses, 1):
+        frame = model.images[image_id].frame
+        frame.set_cam_from_world(1, pycolmap.Rigid3d(np.column_stack(poses[name])))
+        model.register_frame(frame.frame_id)
+    for point, position in enumerate(points):
+        seen_by = [image_id for image_id in rows if point in rows[image_id]]
+        if len(seen_by) > 1:
+            track = pycolmap.Track()
+            for image_id in seen_by:
+                track.add_element(image_id, rows[image_id][point])
+            model.add_point3D(position, track)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("is_shared", "places"),
+    [
+        (poster, [{*HERE}, {*THERE}]),
+        (everything, [{*HERE, *THERE}]),
+        (each_tenth, [{*HERE, *THERE}]),
+    ],
+)
+def test_a_poster_in_two_places_is_told_from_matches_all_over(
+    tmp_path: Path, is_shared: IsShared, places: list[set[int]]
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, is_shared)
+    assert places_of(model, PairGraph.read(path)) == places
+
+
+def test_two_places_with_one_poster_are_two_models_and_each_says_why(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, poster)
+    mapper = mapper_of("sparse")
+
+    def as_found(*_: Any) -> list[MappedModel]:
+        return [MappedModel(model)]
+
+    mapper.map = as_found
+    models = map_database(
+        mapper, task_with_given_cameras(path), tmp_path / "sparse", lambda _: None
+    )
+    assert [one.registered_names for one in models] == [
+        ("0.jpg", "1.jpg", "2.jpg"),
+        ("3.jpg", "4.jpg", "5.jpg"),
+    ]
+    apart = models[0].taken_out
+    assert sorted(apart) == ["3.jpg", "4.jpg", "5.jpg"]
+    assert {doubt.code for doubts in apart.values() for doubt in doubts} == {
+        "other_surroundings"
+    }
