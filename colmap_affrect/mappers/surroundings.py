@@ -9,7 +9,7 @@ from a similar direction and has no surface of its own before it.
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -215,8 +215,17 @@ def _counted(cells: Indices, is_found: Bools) -> Overlap:
     return Overlap(max(num_expected, num_occupied), num_occupied)
 
 
-def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> list[set[int]]:
-    """Return the images of each place that a model holds, the largest one first.
+@dataclass
+class Places:
+    """The images of each place that a model holds, the largest place first."""
+
+    images: list[set[int]]
+    collages: set[int] = field(default_factory=set)
+    """Images of two places: one region matches one of them, another one the other."""
+
+
+def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
+    """Return the places that a model holds.
 
     Images are of one place where pairs tie them whose surroundings match. Parts that other pairs
     tie are two places only where the surroundings contradict that on the whole: images far apart
@@ -231,7 +240,7 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> list[set[int]
     pairs = graph.pairs_inside(images)
     with_pairs = {image_id for pair in pairs for image_id in pair.ids}
     if len(pairs) > MAX_NUM_PAIRS or with_pairs != images:
-        return [images]  # too many to look at, or tied by something else
+        return Places([images])  # too many to look at, or tied by something else
     views = _Views(model)
     overlaps = {pair.ids: views.overlap(*pair.ids) for pair in pairs}
     tied = list[Ids]()
@@ -239,10 +248,11 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> list[set[int]
         if one.tells and one.log_ratio >= 0.0:
             tied.append(ids)
     merged = _merged(connected_parts(tied, images), overlaps)
-    found = list[set[int]]()
+    found = Places([])
     for place in merged:
-        found += _cut_at_collages(place, overlaps, views)
-    return sorted(found, key=lambda part: (-len(part), min(part)))
+        found.images += _cut_at_collages(place, overlaps, views, found.collages)
+    found.images.sort(key=lambda part: (-len(part), min(part)))
+    return found
 
 
 def _merged(
@@ -287,7 +297,10 @@ def _joint_log_ratio(overlaps: Sequence[Overlap]) -> float:
 
 
 def _cut_at_collages(
-    place: set[int], overlaps: Mapping[Ids, Overlap], views: "_Views"
+    place: set[int],
+    overlaps: Mapping[Ids, Overlap],
+    views: _Views,
+    collages: set[int],
 ) -> list[set[int]]:
     """Cut off the parts that one image alone ties, by another region of it.
 
@@ -295,6 +308,7 @@ def _cut_at_collages(
         place: Images.
         overlaps: By pair.
         views: What images observe.
+        collages: Gets these images.
     """
     inside = [ids for ids in overlaps if place.issuperset(ids)]
     for middle in sorted(place):
@@ -302,27 +316,27 @@ def _cut_at_collages(
         sides = connected_parts(others, place - {middle})
         for side in sides[1:]:
             if len(side) > 1 and views.regions_differ(middle, sides[0], side):
-                rest = _cut_at_collages(place - side, overlaps, views)
-                return [*rest, *_cut_at_collages(side, overlaps, views)]
+                collages.add(middle)
+                rest = _cut_at_collages(place - side, overlaps, views, collages)
+                return [*rest, *_cut_at_collages(side, overlaps, views, collages)]
     return [place]
 
 
-def apart(mapped: MappedModel, graph: PairGraph) -> list[MappedModel]:
+def apart(mapped: MappedModel, places: Places) -> list[MappedModel]:
     """Return a model for each place that a model holds; itself, without the others, is the first.
 
     Args:
         mapped: The model; its reconstruction is changed where it holds several places.
-        graph: Its pairs.
+        places: That it holds.
     """
     model = mapped.reconstruction
-    places = places_of(model, graph)
     found = list[MappedModel]()
-    for place in places[1:]:
+    for place in places.images[1:]:
         other = copy.deepcopy(model)
         _keep(other, place)
         found.append(replace(mapped, reconstruction=other))
     if found:
-        _keep(model, places[0])
+        _keep(model, places.images[0])
     return [mapped, *found]
 
 

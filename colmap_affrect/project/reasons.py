@@ -21,6 +21,8 @@ DoubtCode = Literal[
     "bridge_edge",
     "near_others",
     "other_surroundings",
+    "two_places",
+    "hangs_on",
 ]
 
 SENTENCES: dict[DoubtCode, str] = {
@@ -49,6 +51,8 @@ SENTENCES: dict[DoubtCode, str] = {
         "what matches is a part of what it shows, as a poster in two places is: its surroundings, "
         "which the model says are the same, do not match"
     ),
+    "two_places": "it alone ties two places, each by another part of it, as a collage does",
+    "hangs_on": "it hangs on {other}, which is right with a probability of {percent}% itself",
 }
 """What to say of each; the numbers in braces are the values of the doubt."""
 

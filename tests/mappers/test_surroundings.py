@@ -16,9 +16,11 @@ from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.mappers.surroundings import places_of
+from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
 HERE = (1, 2, 3)  # images of one place
@@ -43,10 +45,11 @@ def each_tenth(points: Points) -> Bools:
     return np.asarray(np.arange(len(points)) % 10 == 0)
 
 
-def scene(path: Path, is_shared: IsShared) -> pycolmap.Reconstruction:
+def scene(path: Path, is_shared: IsShared, collage: int = 0) -> pycolmap.Reconstruction:
     """Write a verified database of six images, and return their model.
 
-    Three see the wall of one place and three that of another one; both see what is shared.
+    Three see the wall of one place and three that of another one; both see what is shared. A
+    collage sees one place in its left half, and the other one in its right half.
     """
     random = np.random.default_rng(2)
     points = wall(random, NUM_POINTS)
@@ -58,6 +61,8 @@ def scene(path: Path, is_shared: IsShared) -> pycolmap.Reconstruction:
     for image_id, name in enumerate(poses, 1):
         pixels = project(points, poses[name])
         own = of_first if image_id in HERE else ~of_first
+        if image_id == collage:
+            own = np.where(pixels[:, 0] < WIDTH / 2, of_first, ~of_first)
         seen = np.flatnonzero(is_inside(pixels) & (own | shared))
         keypoints[image_id] = pixels[seen]
         rows[image_id] = {int(point): row for row, point in enumerate(seen)}
@@ -107,23 +112,55 @@ def test_a_poster_in_two_places_is_told_from_matches_all_over(
 ) -> None:
     path = tmp_path / "database.db"
     model = scene(path, is_shared)
-    assert places_of(model, PairGraph.read(path)) == places
+    assert places_of(model, PairGraph.read(path)).images == places
+
+
+def map_as_found(path: Path, mapped: MappedModel) -> list[ModelSummary]:
+    """Score and write a model as if a mapper had made it."""
+    mapper = mapper_of("sparse")
+
+    def as_found(*_: Any) -> list[MappedModel]:
+        return [mapped]
+
+    mapper.map = as_found
+    task = task_with_given_cameras(path)
+    return map_database(mapper, task, path.with_name("sparse"), lambda _: None)
+
+
+def nothing(points: Points) -> Bools:
+    return np.zeros(len(points), bool)
+
+
+def test_parts_that_a_collage_alone_ties_are_two_places_and_it_is_doubtful(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, nothing, collage=3)
+    places = places_of(model, PairGraph.read(path))
+    assert (places.images, places.collages) == ([{3, *THERE}, {1, 2}], {3})
+    (first, *_) = map_as_found(path, MappedModel(model))
+    assert first.probabilities["2.jpg"] < DOUBTFUL < first.probabilities["3.jpg"]
+    assert first.doubtful["2.jpg"][0].code == "two_places"
+
+
+def test_bridged_photograph_is_no_surer_than_what_it_hangs_on(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    mapped = MappedModel(scene(path, everything), {"5.jpg": Bridge("4.jpg", 9, 9, 0.1)})
+    task = task_with_given_cameras(path)
+    ties = {f"{number}.jpg": Confidence(0.3, ()) for number in range(5)}
+    alone = {**ties, "5.jpg": Confidence(0.95, ())}
+    held = {**alone, "3.jpg": Confidence(0.97, ())}
+    found = _no_surer_than_ties(alone, mapped, task)
+    assert found["5.jpg"].probability == 0.3
+    assert found["5.jpg"].reasons[0].code == "hangs_on"
+    assert _no_surer_than_ties(held, mapped, task) == held
 
 
 def test_two_places_with_one_poster_are_two_models_and_each_says_why(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "database.db"
-    model = scene(path, poster)
-    mapper = mapper_of("sparse")
-
-    def as_found(*_: Any) -> list[MappedModel]:
-        return [MappedModel(model)]
-
-    mapper.map = as_found
-    models = map_database(
-        mapper, task_with_given_cameras(path), tmp_path / "sparse", lambda _: None
-    )
+    models = map_as_found(path, MappedModel(scene(path, poster)))
     assert [one.registered_names for one in models] == [
         ("0.jpg", "1.jpg", "2.jpg"),
         ("3.jpg", "4.jpg", "5.jpg"),
