@@ -68,11 +68,9 @@ class MappingTask:
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
     # pairs of image names that only affine frames verify which were not measured one by one
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
-    cameras: Mapping[int, CameraRecord] = field(
-        default_factory=dict
-    )  # what is known, by id
-    # what the straight lines of images say of their cameras, by image name; runs leave it empty,
-    # as far as it is not measured that models of stored lines (FeatureStore.lines) are better
+    # what is known of cameras, by id
+    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
+    # what the straight lines of images say of their cameras, by image name
     lines: Mapping[str, LineCamera] = field(default_factory=dict)
     # Images of one size may turn out to share an uncalibrated camera
     may_share: bool = False

@@ -42,6 +42,7 @@ SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false
 WIDE_SIGMA = 1.0  # of the logarithm of a focal length of which nothing is expected
 MIN_FOCAL_PX = 1e-9  # whose logarithm is taken
+SAME_PX = 1e-3  # to which two principal points are the same
 # By which EXIF and lines may differ before they contradict each other
 MAX_DEVIATIONS = 2.5
 ZOOMS = 1.0, 1.4, 0.7, 2.0
@@ -257,24 +258,49 @@ def _principal_point(
 ) -> PrincipalPointPrior | None:
     """Return what is known of a principal point, None where it is held.
 
-    It is free in crops and where lines tell that it is not in the middle.
+    It is free in crops, where lines tell that it is not in the middle, and where mapping has found
+    that (:mod:`colmap_affrect.mappers.principal_points`).
     """
-    if (
-        record is None
-        or "principal-point" in record.given
-        or not len(camera.principal_point_idxs())
-    ):
+    if record is None or not has_free_center(camera, record):
         return None
     longer_px = max(camera.width, camera.height)
     across_sigma = SHIFTED_SIGMA if record.uncropped_px else MIDDLE_SIGMA
     down = _shift(lines)
     if down is None:
         if not record.uncropped_px:
-            return None
+            return shifted_principal_point(camera) if is_off_center(camera) else None
         down = Normal(0.0, SHIFTED_SIGMA)
     return PrincipalPointPrior(
         (camera.width / 2.0, camera.height / 2.0 + down.mean * longer_px),
         (across_sigma * longer_px, down.sigma * longer_px),
+    )
+
+
+def has_free_center(camera: pycolmap.Camera, record: CameraRecord | None) -> bool:
+    """Tell whether a camera has a principal point that the user has not given.
+
+    Args:
+        camera: The camera.
+        record: What is on record of it; of cameras without one nobody knows what was given.
+    """
+    if record is None or "principal-point" in record.given:
+        return False
+    return len(camera.principal_point_idxs()) > 0
+
+
+def is_off_center(camera: pycolmap.Camera) -> bool:
+    """Tell whether a principal point is not in the middle of the image, where all begin."""
+    return (
+        abs(camera.principal_point_x - camera.width / 2.0) > SAME_PX
+        or abs(camera.principal_point_y - camera.height / 2.0) > SAME_PX
+    )
+
+
+def shifted_principal_point(camera: pycolmap.Camera) -> PrincipalPointPrior:
+    """Return what is known of the principal point of a print, or of a view camera."""
+    sigma_px = SHIFTED_SIGMA * max(camera.width, camera.height)
+    return PrincipalPointPrior(
+        (camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px)
     )
 
 

@@ -19,6 +19,11 @@ from colmap_affrect.mappers.groups import with_other_groups
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
+from colmap_affrect.mappers.principal_points import (
+    contradict_held,
+    with_free_principal_points,
+    with_shifted_axes,
+)
 from colmap_affrect.mappers.search import Search, with_own_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
@@ -33,6 +38,7 @@ SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
 OWN_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
+SHIFTED_AXES = "with optical axes off the middle"
 
 NUM_COLMAP_MODELS = 2  # of COLMAP's models, the largest, that are gone on from (judged)
 FORWARD_MOTION = (
@@ -260,7 +266,9 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.own = own
-        self.best = _restarted(search, task.previous_models)
+        if any(SHIFTED_AXES in mapped.moves for mapped in task.previous_models):
+            self._begin_with_shifted_axes()
+        self.best = _restarted(self.search, task.previous_models)
         self.score = search.best_score(self.best)
 
     def run(self) -> list[MappedModel]:
@@ -275,6 +283,7 @@ class _HypothesisTest:
                 self._try_own_cameras(hypothesis)
         if not self._is_certain():
             self._try_colmap()
+        self._try_shifted_axes()
         self.best = with_other_groups(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
 
@@ -333,6 +342,32 @@ class _HypothesisTest:
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
             self._take(_Hypothesis(COLMAP_MODEL, ()), found, score)
+
+    def _begin_with_shifted_axes(self) -> None:
+        """Go on with what previous models have told of the optical axes."""
+        own = self.own or self.search
+        free = with_free_principal_points(own, self.task.cameras)
+        if free:
+            self.search = free
+            self.own = None
+
+    def _try_shifted_axes(self) -> None:
+        """Free the principal points of the best model where its points ask for it."""
+        search = self.search
+        if not self.best or search.graph.has_rigs:
+            return
+        free = with_free_principal_points(search, self.task.cameras)
+        model = self.best[0].reconstruction
+        if free is None or not contradict_held(model, search, free):
+            return
+        changed = with_shifted_axes(model, free, search.graph)
+        changed_model = replace(self.best[0], reconstruction=changed)
+        found = free.with_bridges(search.graph, [changed_model])
+        found = with_own_images([*found, *self.best[1:]])
+        score = free.best_score(found[:1])
+        if score > self.score + MIN_SCORE_GAIN:
+            self.search = free
+            self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
 
     def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""

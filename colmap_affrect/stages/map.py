@@ -10,6 +10,7 @@ from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
 from colmap_affrect.errors import ConflictError
+from colmap_affrect.geometry.lines import LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
@@ -112,9 +113,26 @@ def _task(
         if copied
         else frozenset(unmeasured_pairs(context)),
         cameras=read_camera_records(workspace.cameras),
+        lines={} if copied else line_cameras(context),
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
     )
+
+
+def line_cameras(context: Context) -> dict[str, LineCamera]:
+    """Return what the straight lines of photographs say of their cameras, by image name.
+
+    None of photographs whose focal length is known, nor of those that have hardly any lines.
+    """
+    found = dict[str, LineCamera]()
+    for record in read_camera_records(context.workspace.cameras).values():
+        names = record.names if record.source == "guess" else ()
+        for name in names:
+            lines = context.features.lines(name)
+            camera = lines.camera() if lines else None
+            if camera:
+                found[name] = camera
+    return found
 
 
 def unmeasured_pairs(context: Context) -> list[Pair]:

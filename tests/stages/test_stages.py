@@ -23,7 +23,7 @@ from verified import CAMERAS, copy_of
 from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
-from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
@@ -41,6 +41,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import advice as advice_module
 from colmap_affrect.report.advice import advice
 from colmap_affrect.session.context import Context, Resources
+from colmap_affrect.stages.map import line_cameras
 from colmap_affrect.stages.verify import verify_matches
 
 CAMERA_ARGUMENTS = ["--camera-mode", "single", *CAMERA[2:]]
@@ -124,6 +125,20 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     said = json.loads(workspace.report.read_text(encoding="utf-8"))["lines"]
     assert said[names[0]]["num_segments"] == len(lines.segments)
     assert 'id="lines"' in workspace.page.read_text(encoding="utf-8")
+
+
+def test_lines_are_asked_for_cameras_that_nobody_knows_alone(copy: Workspace) -> None:
+    context = Context(copy)
+    assert line_cameras(context) == {}
+    records = read_camera_records(copy.cameras)
+    unknown = {key: replace(r, source="guess", given=()) for key, r in records.items()}
+    write_camera_records(copy.cameras, unknown)
+    store = FeatureStore(copy.features)
+    for name in NAMES:
+        lines = store.lines(name)
+        said = lines.camera() if lines else None
+        found = line_cameras(context).get(name)
+        assert (found and found.focal) == (said and said.focal)
 
 
 def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(

@@ -1,0 +1,161 @@
+"""Models whose principal points are not in the middle of their images.
+
+Prints are cut off centre, and view cameras shift their lens. A model with held principal points
+makes up for that by wrong rotations, focal lengths and above all distortion, which keeps it where
+it is once the principal points are free. So the lens is taken for straight at first, and errors
+count from far away, less and less (graduated non-convexity: Blake and Zisserman, Visual
+Reconstruction, 1987). Made-up prints with known cameras are within 0.2 to 3 degrees then, where
+freeing the principal points alone leaves them off by 4 to 8
+(``tests/benchmarks/prints.py``).
+"""
+
+import copy
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.mappers.adjustment import FINAL, MEDIUM
+from colmap_affrect.mappers.camera_priors import (
+    CameraPrior,
+    has_free_center,
+    shifted_principal_point,
+)
+from colmap_affrect.mappers.focal_observability import with_fewer_points
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.search import Search
+
+NOISE_FACTORS = 12.0, 6.0, 3.0
+"""Multiples of the noise of keypoints, by which errors count at first (judged: a print whose
+principal point is off by a tenth has errors of some ten px). Half of that or twice as much gives
+the same models."""
+USUAL_LIMIT = 2.0
+"""Multiple of the noise that the limits of triangulation and of filters are made for."""
+ANGLE_LIMITS = (
+    "create_max_angle_error",
+    "continue_max_angle_error",
+    "re_max_angle_error",
+)
+ERROR_LIMITS = "merge_max_reproj_error", "complete_max_reproj_error"
+
+
+def with_free_principal_points(
+    search: Search, records: Mapping[int, CameraRecord]
+) -> Search | None:
+    """Return a search in which principal points that nobody knows are free.
+
+    Of cameras that several images share they stay in the middle: these are not prints, or not all
+    of them are cut in the same way.
+
+    Args:
+        search: The same with principal points that are held.
+        records: What is on record of the cameras, by camera id.
+
+    Returns:
+        The search, None where all principal points are known.
+    """
+    cameras = search.graph.cameras.values()
+    num_images = Counter(camera.camera_id for camera in cameras)
+    priors = dict(search.adjuster.priors)
+    for camera in cameras:
+        key = camera.camera_id
+        is_own = num_images[key] == 1
+        is_held = priors[key].principal_point is None
+        is_unknown = priors[key].is_unknown and has_free_center(
+            camera, records.get(key)
+        )
+        if is_own and is_held and is_unknown:
+            principal_point = shifted_principal_point(camera)
+            priors[key] = replace(priors[key], principal_point=principal_point)
+    if priors == search.adjuster.priors:
+        return None
+    return _with_priors(search, priors)
+
+
+def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) -> bool:
+    """Tell whether the points of a model say that principal points are not where they are held.
+
+    The cost with free ones must be lower by more than free parameters are worth (BIC: Schwarz,
+    Estimating the dimension of a model, 1978), half the logarithm of the number of observations
+    each. Made-up prints cut off centre gain 120 to 550, whole photographs 2 to 16, where 50 to 90
+    are needed.
+
+    Args:
+        model: With held principal points; it stays as it is.
+        held: The search that made it.
+        free: The search with free principal points.
+    """
+    fixed = with_fewer_points(model)
+    num_observations = fixed.compute_num_observations()
+    if not num_observations:
+        return False
+    fixed_cost = held.adjuster.adjust(fixed, FINAL)
+    free_cost = free.adjuster.adjust(with_fewer_points(model), FINAL)
+    num_freed = 0
+    for key in {camera.camera_id for camera in cameras_of(model).values()}:
+        prior = free.adjuster.priors[key]
+        if prior.principal_point and not held.adjuster.priors[key].principal_point:
+            num_freed += 1
+    per_parameter = 0.5 * math.log(num_observations)
+    return fixed_cost - free_cost > 2 * num_freed * per_parameter
+
+
+def with_shifted_axes(
+    model: pycolmap.Reconstruction, free: Search, graph: PairGraph
+) -> pycolmap.Reconstruction:
+    """Return a model with free principal points.
+
+    Args:
+        model: With held principal points; it stays as it is.
+        free: The search with free principal points.
+        graph: Pairs that the model is made from.
+    """
+    changed = pycolmap.Reconstruction(model)
+    for camera in changed.cameras.values():
+        if free.adjuster.priors[camera.camera_id].is_unknown:
+            for index in camera.extra_params_idxs():
+                camera.params[index] = 0.0
+    straight = dict[int, CameraPrior]()
+    for key, prior in free.adjuster.priors.items():
+        straight[key] = replace(
+            prior, has_distortion=prior.has_distortion and not prior.is_unknown
+        )
+    for factor in NOISE_FACTORS:
+        coarse = _coarser(_with_priors(free, straight), factor)
+        changed = _restarted(changed, coarse, graph, MEDIUM)
+    changed = _restarted(changed, _with_priors(free, straight), graph, MEDIUM)
+    return _restarted(changed, free, graph, FINAL)
+
+
+def _restarted(
+    model: pycolmap.Reconstruction, search: Search, graph: PairGraph, iterations: int
+) -> pycolmap.Reconstruction:
+    """Return a model with the poses and cameras of another one, and points of its own."""
+    grower = search.grower(graph)
+    changed = grower.restart_from(model)
+    grower.finish(changed, iterations)
+    return changed
+
+
+def _coarser(search: Search, factor: float) -> Search:
+    """Return a search in which keypoints are so many times as noisy, and limits wider."""
+    native = copy.deepcopy(search.native)
+    wider = max(1.0, factor / USUAL_LIMIT)
+    native.mapper.filter_max_reproj_error *= wider
+    for name in (*ANGLE_LIMITS, *ERROR_LIMITS):
+        value = getattr(native.triangulation, name)
+        setattr(native.triangulation, name, value * wider)
+    noise_px = search.adjuster.noise_px * factor
+    adjuster = replace(search.adjuster, noise_px=noise_px)
+    return replace(search, native=native, adjuster=adjuster)
+
+
+def _with_priors(search: Search, priors: Mapping[int, CameraPrior]) -> Search:
+    """Return a search that adjusts and scores with other priors of cameras."""
+    return replace(
+        search,
+        adjuster=replace(search.adjuster, priors=priors),
+        scorer=replace(search.scorer, priors=priors),
+    )
