@@ -245,11 +245,11 @@ def _write_models(
 def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]:
     """Return a model for each place that a model holds, the largest first, with all scored.
 
-    A model that is extended stays whole, and what a person has tied by hand.
+    A model that is extended stays whole, what a person has tied by hand, and rigs.
     """
-    if task.extend or task.tie_points:
-        return [_without_wrong_images(mapped, task)]
     graph = graph_of(task, MIN_NUM_MATCHES)
+    if task.extend or task.tie_points or graph.has_rigs:
+        return [_without_wrong_images(mapped, task)]
     places = places_of(mapped.reconstruction, graph)
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
