@@ -21,6 +21,7 @@ from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     contradict_held,
+    principal_point_cost,
     with_free_principal_points,
     with_shifted_axes,
 )
@@ -365,7 +366,8 @@ class _HypothesisTest:
         found = free.with_bridges(search.graph, [changed_model])
         found = with_own_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
-        if score > self.score + MIN_SCORE_GAIN:
+        paid = principal_point_cost(found[0].reconstruction, free)  # by the points
+        if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
             self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
 
