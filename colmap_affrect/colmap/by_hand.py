@@ -7,7 +7,7 @@ the others, and without the verified pairs that are not to be used.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -130,7 +130,7 @@ class ByHand(Options):
 
         def change(database: pycolmap.Database) -> None:
             found.update(self._add_tie_points(database))
-            self._delete_geometries(database)
+            self._delete_pairs(database)
 
         copy_database(source, target, change=change)
         return found
@@ -157,14 +157,13 @@ class ByHand(Options):
             _append_keypoints(database, image_ids[name], np.array(positions))
         return indices
 
-    def _delete_geometries(self, database: pycolmap.Database) -> None:
-        """Delete the two-view geometries of pairs that may not be used."""
+    def _delete_pairs(self, database: pycolmap.Database) -> None:
+        """Delete matches and two-view geometries of pairs that may not be used."""
         names = {image.image_id: image.name for image in database.read_all_images()}
-        pair_ids, _ = database.read_two_view_geometry_num_inliers()
-        for pair_id in pair_ids:
-            image_id1, image_id2 = pycolmap.pair_id_to_image_pair(pair_id)
-            if not self.allows(names[image_id1], names[image_id2]):
-                database.delete_two_view_geometry(image_id1, image_id2)
+        for ids in combinations(sorted(names), 2):
+            if not self.allows(names[ids[0]], names[ids[1]]):
+                database.delete_two_view_geometry(*ids)
+                database.delete_matches(*ids)
 
 
 NOTHING = ByHand()

@@ -121,8 +121,8 @@ class MappedModel:
     """By the names of images that came in by one verified pair, not by tracks of three images."""
     # Hypotheses that made the model, in the words of a report
     hypotheses: tuple[str, ...] = ()
-    add_last_points: Callable[[], None] | None = None
-    """Gives the reconstruction its last points and colours; called once, when images are scored."""
+    add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
+    """Gives a reconstruction its last points and colours; called once, when images are scored."""
 
 
 class Mapper(Protocol):

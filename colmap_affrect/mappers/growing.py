@@ -4,6 +4,7 @@ All adjustments have priors on intrinsics (:mod:`colmap_affrect.mappers.adjustme
 """
 
 import copy
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,12 @@ from colmap_affrect.mappers.pair_graph import (
 )
 
 MIN_POINTS = 10  # of a first pair (judged)
+MIN_FEW_POINTS = 6
+"""Points that register an image whose pairs have few matches, or of such a first pair: three more
+than determine a pose, each of which chance explains once in a thousand times (theory)."""
+MIN_INIT_SHARE = 0.8
+"""Inliers of a first pair, as a share of those of the strongest pair, where none has as many as are
+asked for (judged)."""
 # Images up to which each new one is followed by a global adjustment; resource
 NUM_ALWAYS_ADJUSTED = 10
 # Of the number of images from one global adjustment to the next; COLMAP has 1.1; resource
@@ -56,6 +63,10 @@ class Grower:
         self.native = native
         self.show = show
         self.options = native.get_mapper()
+        self.options_of_few = native.get_mapper()
+        self.options_of_few.abs_pose_min_num_inliers = min(
+            MIN_FEW_POINTS, self.options.abs_pose_min_num_inliers
+        )
         self.triangulation = native.get_triangulation()
 
     @contextmanager
@@ -72,17 +83,41 @@ class Grower:
         model = pycolmap.Reconstruction()
         with self._mapping(model) as mapper:
             self.adjuster.set_initial_focals(model)
-            pose = mapper.estimate_initial_two_view_geometry(self.options, *pair)
+            options = self._options_of_first()
+            pose = mapper.estimate_initial_two_view_geometry(options, *pair)
+            pose = pose or self._pose_of_few(model, pair)
             if pose is None:
                 return None
-            mapper.register_initial_image_pair(self.options, *pair, pose)
+            mapper.register_initial_image_pair(options, *pair, pose)
             self._triangulate(mapper, pair)
             self._adjust(mapper, FAST)
             self.show(len(pair))
-            if model.num_points3D() < MIN_POINTS:
+            is_of_few = not self.graph.with_few_only.isdisjoint(pair)
+            if model.num_points3D() < (MIN_FEW_POINTS if is_of_few else MIN_POINTS):
                 return None
             self._complete(mapper)
         return model
+
+    def _options_of_first(self) -> pycolmap.IncrementalMapperOptions:
+        """Return the options for a first pair; where no pair has many inliers, fewer are enough."""
+        options = copy.copy(self.options)
+        strongest = max(len(pair.matches) for pair in self.graph.pairs)
+        enough = max(MIN_FEW_POINTS, math.floor(MIN_INIT_SHARE * strongest))
+        options.init_min_num_inliers = min(options.init_min_num_inliers, enough)
+        return options
+
+    def _pose_of_few(
+        self, model: pycolmap.Reconstruction, ids: tuple[int, int]
+    ) -> pycolmap.Rigid3d | None:
+        """Return cam2_from_cam1 of a pair with few matches: COLMAP begins with no such pair."""
+        few = [pair for pair in self.graph.pairs if pair.ids == ids and pair.is_few]
+        if not few:
+            return None
+        cameras = {i: model.cameras[model.images[i].camera_id] for i in ids}
+        poses = self.graph.relative_poses(few[0], cameras, self.native.random_seed)
+        if not poses:
+            return None
+        return pycolmap.Rigid3d(np.column_stack(poses[0].pose))
 
     def adjust_fully(
         self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
@@ -165,8 +200,11 @@ class Grower:
 
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
         """Register one more image by points that it sees; return its id."""
-        for image_id in mapper.find_next_images(self.options, False):
-            if mapper.register_next_image(self.options, image_id):
+        with_few = self.graph.with_few_only
+        options = self.options_of_few if with_few else self.options
+        for image_id in mapper.find_next_images(options, False):
+            options = self.options_of_few if image_id in with_few else self.options
+            if mapper.register_next_image(options, image_id):
                 return image_id
         return None
 

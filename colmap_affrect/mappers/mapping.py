@@ -3,10 +3,12 @@
 A summary of each finished model is kept beside it: COLMAP's files cannot hold it all.
 """
 
+import math
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +25,22 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
-from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, PairGraph, graph_of
-from colmap_affrect.mappers.reliability import Confidence, score_images
+from colmap_affrect.mappers.pair_graph import (
+    MIN_NUM_MATCHES,
+    MIN_SHARE,
+    PairGraph,
+    cameras_of,
+    graph_of,
+    poses_of,
+)
+from colmap_affrect.mappers.reliability import NUM_REASONS, Confidence, score_images
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
+from colmap_affrect.mappers.surroundings import apart, places_of
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
 
@@ -173,7 +184,9 @@ def map_database(
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
             remove_own([raw])
-        scored = [_without_wrong_images(model, task) for model in found]
+        scored = list[_ScoredModel]()
+        for model in found:
+            scored += _scored_places(model, task)
         min_model_size = 1 if task.extend else mapper.options.min_model_size
         kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
@@ -220,12 +233,46 @@ def _write_models(
     for index, model in enumerate(models):
         path = folder / str(index)
         if model.mapped.add_last_points:
-            model.mapped.add_last_points()
+            model.mapped.add_last_points(model.mapped.reconstruction)
         write_model(model.mapped.reconstruction, path)
         summary = _summary(model, task)
         write_summary(summary, path)
         summaries.append(summary)
     return summaries
+
+
+def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]:
+    """Return a model for each place that a model holds, the largest first, with all scored.
+
+    A model that is extended stays whole, what a person has tied by hand, and rigs.
+    """
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    if task.extend or task.tie_points or graph.has_rigs:
+        return [_without_wrong_images(mapped, task)]
+    places = places_of(mapped.reconstruction, graph)
+    largest, *others = apart(mapped, places)
+    scored = _without_wrong_images(largest, task)
+    found = [scored]
+    for other in others:
+        names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
+        for name in names:
+            scored.taken_out[name] = Confidence(0.0, (Doubt("other_surroundings"),))
+        if len(names) > 1:
+            found.append(_without_wrong_images(other, task))
+    for model in found:
+        for image_id in places.collages:
+            _doubt_collage(model, graph.names[image_id])
+    return found
+
+
+def _doubt_collage(model: _ScoredModel, name: str) -> None:
+    """Halve the probability of an image that is as likely of another place, if it is there."""
+    known = model.confidences.get(name)
+    if known:
+        reasons = (Doubt("two_places"), *known.reasons)[:NUM_REASONS]
+        model.confidences[name] = replace(
+            known, probability=known.probability / 2, reasons=reasons
+        )
 
 
 def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredModel:
@@ -250,9 +297,42 @@ def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredMode
             growths = focal_growths(model, task)
             is_stale = False
         else:
-            scored.confidences = confidences
+            scored.confidences = _no_surer_than_ties(confidences, mapped, task)
             return scored
     return scored
+
+
+def _no_surer_than_ties(
+    confidences: Mapping[str, Confidence], mapped: MappedModel, task: MappingTask
+) -> dict[str, Confidence]:
+    """Return confidences of which those of bridged images are at most what they hang on.
+
+    Args:
+        confidences: By image name.
+        mapped: The model.
+        task: What it was made from.
+    """
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    poses = poses_of(mapped.reconstruction)
+    cameras = cameras_of(mapped.reconstruction)
+    ties = defaultdict[str, dict[str, float]](dict)
+    for pair in graph.pairs_inside(poses):
+        if graph.agreement(pair, poses, cameras) >= MIN_SHARE:
+            first, second = (graph.names[image_id] for image_id in pair.ids)
+            ties[first][second] = confidences[second].probability
+            ties[second][first] = confidences[first].probability
+    found = dict(confidences)
+    for name in mapped.bridges.keys() & confidences.keys():
+        surest = max(ties[name], key=lambda other: ties[name][other], default=None)
+        if surest is None or ties[name][surest] >= confidences[name].probability:
+            continue
+        percent = math.floor(100.0 * ties[name][surest])
+        doubt = Doubt("hangs_on", {"other": surest, "percent": percent})
+        reasons = (doubt, *confidences[name].reasons)[:NUM_REASONS]
+        found[name] = replace(
+            confidences[name], probability=ties[name][surest], reasons=reasons
+        )
+    return found
 
 
 def _deregister(model: pycolmap.Reconstruction, name: str) -> list[str]:

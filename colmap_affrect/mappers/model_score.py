@@ -143,9 +143,20 @@ def _seen_by_three(points: Mapping[int, Indices]) -> Indices:
 
 def _log_ratio(num_agreeing: float, num: float, right: Beta) -> float:
     """Return the log-likelihood ratio of right models against wrong ones."""
+    return beta_log_ratio(num_agreeing, num, right, CHANCE)
+
+
+def beta_log_ratio(num_agreeing: float, num: float, right: Beta, wrong: Beta) -> float:
+    """Return the log-likelihood ratio of two distributions of a count.
+
+    Args:
+        num_agreeing: The count.
+        num: Of so many.
+        right: Of shares, if right.
+        wrong: Of shares, if wrong.
+    """
     by_right = _log_beta_binomial(num_agreeing, num, right)
-    by_chance = _log_beta_binomial(num_agreeing, num, CHANCE)
-    return by_right - by_chance
+    return by_right - _log_beta_binomial(num_agreeing, num, wrong)
 
 
 def _log_beta_binomial(num_agreeing: float, num: float, prior: Beta) -> float:

@@ -3,7 +3,7 @@
 import copy
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -30,6 +30,12 @@ from colmap_affrect.geometry.two_views import (
     triangulated_depths,
 )
 from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.caches import empty_copy
+from colmap_affrect.mappers.few_matches import (
+    MIN_FEW,
+    FewMatches,
+    sure_few_matches,
+)
 from colmap_affrect.mappers.thinning import matches_of_best_tracks
 
 Ids = tuple[int, int]  # of two images
@@ -58,6 +64,7 @@ class VerifiedPair:
     ids: Ids
     matches: Indices  # (M, 2) features that are inliers
     geometry: pycolmap.TwoViewGeometry  # of the pair in the database
+    is_few: bool = False  # it has few matches, which are sure all the same
 
 
 Pairs = tuple[VerifiedPair, ...]
@@ -113,10 +120,14 @@ class PairGraph:
 
         Args:
             path: The database.
-            min_num_matches: Pairs with fewer inliers are left out.
+            min_num_matches: Pairs with fewer inliers are left out, but for those that are sure all
+                the same (:mod:`colmap_affrect.mappers.few_matches`).
         """
         with open_database(path) as database:
-            return cls.of(database, min_num_matches)
+            graph = cls.of(database, min_num_matches)
+            enough = {pair.ids: pair.matches for pair in graph.verified}
+            few = sure_few_matches(database, enough)
+            return graph._with_few(few, database) if few else graph
 
     @classmethod
     def of(
@@ -144,6 +155,25 @@ class PairGraph:
         kept = [pair for pair in self.verified if pair.ids not in ids]
         return self._with(kept, self.cache)
 
+    def _with_few(self, few: Iterable[FewMatches], database: pycolmap.Database) -> Self:
+        """Add pairs with few matches, whose keypoints a database has."""
+        verified = [*self.verified]
+        keypoints = {**self.keypoints}
+        for one in few:
+            for image_id in one.ids:
+                if image_id not in keypoints:
+                    rows = database.read_keypoints(image_id)
+                    keypoints[image_id] = np.array(rows[:, :2], np.float32)
+            pair = VerifiedPair(one.ids, one.matches, one.geometry, True)
+            verified.append(pair)
+        return replace(self, keypoints=keypoints)._with(verified, self.cache)
+
+    @cached_property
+    def with_few_only(self) -> frozenset[int]:
+        """The images none of whose pairs has many matches."""
+        with_many = _images_of(pair for pair in self.verified if not pair.is_few)
+        return frozenset(_images_of(self.verified) - with_many)
+
     @property
     def verified(self) -> Pairs:
         """All pairs, also those that are not among the strongest."""
@@ -166,7 +196,7 @@ class PairGraph:
         for key, record in records.items():
             for name in record.names:
                 camera_of[name] = key
-        cache = _empty_copy(self.cache, camera_of)
+        cache = empty_copy(self.cache, camera_of)
         cameras = {**self.cameras}
         for image_id, image in cache.images.items():
             cameras[image_id] = cache.cameras[image.camera_id]
@@ -193,8 +223,12 @@ class PairGraph:
         self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache
     ) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
-        kept = [pair for pair in verified if len(pair.matches) >= self.min_num_matches]
-        new = _empty_copy(cache, {})
+        kept = list[VerifiedPair]()
+        for pair in verified:
+            least = MIN_FEW if pair.is_few else self.min_num_matches
+            if len(pair.matches) >= least:
+                kept.append(pair)
+        new = empty_copy(cache, {})
         for pair in kept:
             geometry = copy.copy(pair.geometry)
             geometry.inlier_matches = pair.matches.astype(np.uint32)
@@ -411,52 +445,3 @@ def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
             weak.append(pair)
         counts.update(pair.ids)
     return tuple(sorted(strong, key=lambda pair: pair.ids)), tuple(weak)
-
-
-def _empty_copy(
-    cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int]
-) -> pycolmap.DatabaseCache:
-    """Return the used cameras, rigs and images of a cache, without pairs.
-
-    Args:
-        cache: It stays as it is.
-        camera_of: Other cameras of some images, by image name.
-    """
-    rig_of = {rig.ref_sensor_id: rig.rig_id for rig in cache.rigs.values()}
-    frames = dict(cache.frames)
-    images = [copy.copy(image) for image in cache.images.values()]
-    for image in images:
-        key = camera_of.get(image.name, image.camera_id)
-        if key != image.camera_id:
-            image.camera_id = key
-            rig_id = rig_of[cache.cameras[key].sensor_id]
-            frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=rig_id)
-            frame.add_data_id(image.data_id)
-            frames[image.frame_id] = frame
-    used_rigs = sorted({frame.rig_id for frame in frames.values()})
-    return _filled_cache(cache, used_rigs, frames.values(), images)
-
-
-def _filled_cache(
-    cache: pycolmap.DatabaseCache,
-    rig_ids: Sequence[int],
-    frames: Iterable[pycolmap.Frame],
-    images: Iterable[pycolmap.Image],
-) -> pycolmap.DatabaseCache:
-    """Return a cache with some rigs of another one and their cameras, frames and images."""
-    new = pycolmap.DatabaseCache()
-    sensors = set[Any]()
-    for rig_id in rig_ids:
-        sensors |= cache.rigs[rig_id].sensor_ids()
-    for camera in cache.cameras.values():
-        if camera.sensor_id in sensors:
-            new.add_camera(camera)
-    for rig_id in rig_ids:
-        new.add_rig(cache.rigs[rig_id])
-    for frame in frames:
-        new.add_frame(frame)
-    for image in images:
-        new.add_image(image)
-    for prior in cache.pose_priors:
-        new.add_pose_prior(prior)
-    return new

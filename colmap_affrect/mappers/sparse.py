@@ -15,6 +15,7 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
 from colmap_affrect.mappers.final_points import complete_points
+from colmap_affrect.mappers.groups import with_other_groups
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
@@ -169,10 +170,7 @@ class SparseMapper(IncrementalMapper):
             complete_points(model, graph, native, self.options.noise_px, tie_points)
             _extract_colors(model, task, native)
 
-        return [
-            replace(m, add_last_points=partial(add_last_points, m.reconstruction))
-            for m in models
-        ]
+        return [replace(m, add_last_points=add_last_points) for m in models]
 
     def _search(
         self,
@@ -292,6 +290,7 @@ class _HypothesisTest:
         if not self._is_certain():
             self._try_colmap()
         self._try_shifted_axes()
+        self.best = with_other_groups(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
 
     def _hypotheses(self) -> list[_Hypothesis]:

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import SIGMA_PX
 from colmap_affrect.colmap.model_files import Pose
+from colmap_affrect.colmap.two_views import Cameras
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import BridgeFinder
@@ -19,6 +21,8 @@ from colmap_affrect.mappers.pair_graph import CameraById, PoseById, cameras_of, 
 from colmap_affrect.mappers.tie_points import AGREEING_PX, MIN_NUM_POINTS, TiePoints
 
 BY_HAND = "with tie points"  # what made the model, in the words of a report
+MIN_NUM_OF_FIRST = 7
+"""Tie points of two images that begin a model: two more than determine an essential matrix."""
 MAX_SIM3_ERROR = 0.1  # of tie points of two models, in units of their spread (judged)
 
 
@@ -66,6 +70,8 @@ class TieJoiner:
             models, key=lambda mapped: -mapped.reconstruction.num_reg_images()
         )
         joined = list[MappedModel]()
+        if not left:
+            left = self._begun()
         while left:
             mapped = left.pop(0)
             for image_id in self.points.misplaced(mapped.reconstruction):
@@ -81,6 +87,59 @@ class TieJoiner:
             self.points.observe(mapped.reconstruction)
             joined.append(mapped)
         return joined
+
+    def _begun(self) -> list[MappedModel]:
+        """Return the model of the two images with most tie points in common that tell a pose."""
+        graph = self.grower.graph
+        marks_of = {}
+        for image in graph.cache.images.values():
+            marks_of[image.image_id] = self.points.marks(image)
+        together = dict[tuple[int, int], list[str]]()
+        for first, second in combinations(sorted(marks_of), 2):
+            names = sorted(marks_of[first].keys() & marks_of[second].keys())
+            if len(names) >= MIN_NUM_OF_FIRST:
+                together[first, second] = names
+        for ids in sorted(together, key=lambda ids: (-len(together[ids]), ids)):
+            cameras = {i: copy.copy(graph.cameras[i]) for i in ids}
+            for image_id, camera in list(cameras.items()):
+                prior = self.grower.adjuster.priors[camera.camera_id]
+                if prior.is_unknown:
+                    cameras[image_id] = _with_focal(camera, prior.starts_px[0])
+            points = []
+            for image_id in ids:
+                found = [marks_of[image_id][name] for name in together[ids]]
+                points.append(np.array(found, np.float64))
+            both = cameras[ids[0]], cameras[ids[1]]
+            relative = self._relative_pose(points[0], points[1], both)
+            if relative is not None:
+                poses = {ids[0]: (np.eye(3), np.zeros(3)), ids[1]: relative}
+                model = self.grower.register_at(
+                    poses, cameras, pycolmap.Reconstruction()
+                )
+                return [MappedModel(model, hypotheses=(BY_HAND,))]
+        return []
+
+    def _relative_pose(
+        self, points1: Array, points2: Array, cameras: Cameras
+    ) -> Pose | None:
+        """Return cam2_from_cam1 of the marks of two images.
+
+        Args:
+            points1: (N, 2) px in the first image.
+            points2: (N, 2) px in the second one.
+            cameras: Of both.
+
+        Returns:
+            The pose, with a translation of length 1; None where most marks agree with none.
+        """
+        options = self._ransac(AGREEING_PX)
+        found: Any = pycolmap.estimate_essential_matrix(
+            points1, points2, *cameras, options
+        )
+        if not found or found["num_inliers"] < MIN_NUM_OF_FIRST:
+            return None
+        matrix = found["cam2_from_cam1"].matrix()
+        return matrix[:, :3], matrix[:, 3]
 
     def _with(self, mapped: MappedModel, new: _NewImages) -> MappedModel:
         """Register images, and what bridges register from there."""

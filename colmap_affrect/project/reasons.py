@@ -20,6 +20,9 @@ DoubtCode = Literal[
     "tie_points_disagree",
     "bridge_edge",
     "near_others",
+    "other_surroundings",
+    "two_places",
+    "hangs_on",
 ]
 
 SENTENCES: dict[DoubtCode, str] = {
@@ -44,6 +47,12 @@ SENTENCES: dict[DoubtCode, str] = {
         "it stands so near to others that the direction between them may be off by "
         "{sigma_deg:.0f} degrees"
     ),
+    "other_surroundings": (
+        "what matches is a part of what it shows, as a poster in two places is: its surroundings, "
+        "which the model says are the same, do not match"
+    ),
+    "two_places": "it alone ties two places, each by another part of it, as a collage does",
+    "hangs_on": "it hangs on {other}, which is right with a probability of {percent}% itself",
 }
 """What to say of each; the numbers in braces are the values of the doubt."""
 
@@ -89,6 +98,8 @@ def mappings_of(
 
 MissingCode = Literal[
     "another_model",
+    "another_group",
+    "another_place",
     "left_out",
     "unreadable",
     "no_features",
@@ -99,6 +110,8 @@ MissingCode = Literal[
 
 FATES: dict[MissingCode, str] = {
     "another_model": "in another model, sparse/{model}",
+    "another_group": "in another model, sparse/{model}, whose photographs match only each other",
+    "another_place": "in another model, sparse/{model}: {doubts}",
     "left_out": "left out by hand",
     "unreadable": "unreadable",
     "no_features": "no features",

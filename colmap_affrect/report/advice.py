@@ -6,9 +6,13 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from colmap_affrect.errors import such_as
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.pair_graph import MAX_ERROR
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.reasons import Doubt, DoubtCode
@@ -18,6 +22,8 @@ from colmap_affrect.session.context import Context, Inputs
 
 STRONGEST = "default"  # of the recipes
 ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
+# Inliers of a pair that a homography explains, from which on they show no depth (judged)
+MIN_SHARE_WITHOUT_DEPTH = 0.9
 MIN_GAIN = 0.05  # of a probability, by more matches
 CONTRADICTED: Collection[DoubtCode] = ("matches_disagree", "little_agreement")
 """Doubts of photographs whose matches are rather wrong than few."""
@@ -100,6 +106,8 @@ def advice(
     found = _of_effort(case)
     if not models and strongest >= ENOUGH:
         why = "more photographs, from other places: the matches of these show no depth"
+        if _share_without_depth(context) < MIN_SHARE_WITHOUT_DEPTH:
+            why = "more photographs between these: matches show depth, but contradict each other"
         return (*found, Advice(why))
     if lost or case.doubts:
         for rule in RULES:
@@ -115,6 +123,29 @@ def command_with_tie_points(context: Context) -> str:
 def command_with_masks(context: Context) -> str:
     """Return a command that runs anew with masks that were painted on the page of a run."""
     return _anew(context, "--mask-path", "masks")
+
+
+def _share_without_depth(context: Context) -> float:
+    """Return the share of the inliers of the strongest pair that no depth has to explain.
+
+    A homography explains them: of a plane, or of a camera that turned, whatever its focal length
+    and its optical axis.
+    """
+    inliers = context.graph.inliers(1)
+    names = max(inliers, key=lambda pair: len(inliers[pair]))
+    points = []
+    sides = []
+    with context.graph.open_to_read() as database:
+        for side, name in enumerate(names):
+            keypoints = database.read_keypoints(context.graph.ids[name])
+            rows = inliers[names][:, side]
+            points.append(np.asarray(keypoints, np.float64)[rows, :2])
+            camera = context.graph.cameras[name]
+            sides += [camera.width, camera.height]
+    _, is_explained = cv2.findHomography(
+        points[0], points[1], cv2.RANSAC, MAX_ERROR * max(sides)
+    )
+    return 0.0 if is_explained is None else float(np.mean(is_explained))
 
 
 def _of_fitting_focal(case: _Case) -> list[Advice]:
@@ -156,7 +187,8 @@ def _of_tie_points(case: _Case) -> list[Advice]:
 def _of_bridges(case: _Case) -> list[Advice]:
     found = list[Advice]()
     for name, bridge in case.model.bridges.items():
-        if name in case.model.doubtful:
+        codes = {doubt.code for doubt in case.model.doubtful.get(name, ())}
+        if not codes.isdisjoint(CONTRADICTED):
             why = f"if the matches of {name} and {bridge.by} are wrong by eye, leave them out"
             command = _again(case.context, "--reject-pair", as_row([name, bridge.by]))
             found.append(Advice(why, command))

@@ -104,7 +104,7 @@ class ReportFile(Described):
     """Photographs that see a point, on average."""
     mean_reprojection_error_px: float
     """Mean distance between observations and points."""
-    moves: list[str]
+    hypotheses: list[str]
     """What made the model, by the sparse mapper."""
     one_view: list[tuple[str, str]]
     """Pairs of prints of one negative, or from one place."""

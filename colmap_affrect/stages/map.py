@@ -215,19 +215,36 @@ def unregistered(
     for name in names:
         if name in registered:
             continue
-        reasons[name] = _why_not_mapped(context, name, models[1:]) or _why_lost(
-            name, partners[name], largest
-        )
+        why = _why_not_mapped(context, name, models, partners)
+        reasons[name] = why or _why_lost(name, partners[name], largest)
     return reasons
 
 
 def _why_not_mapped(
-    context: Context, name: str, others: Sequence[ModelSummary]
+    context: Context,
+    name: str,
+    models: Sequence[ModelSummary],
+    partners: Mapping[str, Mapping[str, int]],
 ) -> Missing | None:
-    """Return why an image could not be in the largest model; None where it could."""
-    for number, model in enumerate(others, start=1):
-        if name in model.registered_names:
-            return Missing("another_model", number)
+    """Return why an image could not be in the largest model; None where it could.
+
+    Args:
+        context: of the workspace.
+        name: of the image.
+        models: the largest first.
+        partners: inliers of verified pairs, by both images.
+    """
+    for number, model in enumerate(models[1:], start=1):
+        if name not in model.registered_names:
+            continue
+        if name in models[0].taken_out:
+            doubts = models[0].taken_out[name]
+            return Missing("another_place", number, doubts=doubts)
+        tied = set[str]()
+        for inside in model.registered_names:
+            tied |= partners.get(inside, {}).keys()
+        is_apart = tied <= {*model.registered_names}
+        return Missing("another_group" if is_apart else "another_model", number)
     if name in context.by_hand.left_out:
         return Missing("left_out")
     num_keypoints = context.graph.num_keypoints

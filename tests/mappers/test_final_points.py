@@ -169,7 +169,7 @@ def test_tracks_of_two_images_are_refined_where_those_of_three_make_the_model(
     model = mapped.reconstruction
     before = bits(model), mean_error_of_two_views(model), model.num_points3D()
     assert mapped.add_last_points is not None
-    mapped.add_last_points()
+    mapped.add_last_points(mapped.reconstruction)
     assert bits(model) == before[0]
     assert (
         mean_error_of_two_views(model) < 0.95 * before[1]

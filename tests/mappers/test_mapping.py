@@ -258,7 +258,7 @@ def test_two_places_make_two_models_the_largest_first(
     small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
     assert [model.registered_names for model in report.models] == [large, small]
     assert report.status == "partial"
-    assert report.unregistered == dict.fromkeys(small, Missing("another_model", 1))
+    assert report.unregistered == dict.fromkeys(small, Missing("another_group", 1))
     assert "models      2, of 3, 2 images" in report.summary()
     assert [*map(tuple, report.to_mapping()["models"])] == [large, small]
     folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())

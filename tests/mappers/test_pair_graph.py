@@ -12,6 +12,7 @@ from mapping_tasks import synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers import pair_graph
@@ -191,4 +192,6 @@ def test_pairs_of_fewer_than_fifteen_inliers_are_left_out(tmp_path: Path) -> Non
     for num_points in (14, 16):
         path = tmp_path / f"{num_points}.db"
         synthesize(path, num_rigs=2, num_points3D=num_points)
+        with open_database(path) as database:
+            database.clear_matches()  # which would say whether a few are sure
         assert len(PairGraph.read(path).pairs) == (num_points > 15)

@@ -38,6 +38,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import advice as advice_module
 from colmap_affrect.report.advice import advice
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages.map import line_cameras
@@ -233,12 +234,17 @@ def test_advice_is_about_what_is_wrong(
     contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
     wrong = replace(model, taken_out={lost: (contradicted,)})
     assert commands([lost], wrong)[0] == anew.format("--focal-length-px 8")
-    disagreeing = Doubt("little_agreement", {"percent": 9})
-    disputed = replace(model, doubtful={lost: (disagreeing,)}, gains={lost: 0.3})
+    little = Doubt("little_agreement", {"percent": 9})
+    disputed = replace(model, doubtful={lost: (little,)}, gains={lost: 0.3})
     assert commands([], disputed) == [more, anew.format("--mask-path masks")]
     bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
     alone = replace(model, doubtful={lost: (Doubt("few_matches"),)}, bridges=bridged)
-    assert commands([], alone) == [f"{again} --reject-pair '{lost},{NAMES[1]}'"]
+    assert commands([], alone) == []  # nothing contradicts its matches
+    bridged_wrongly = replace(disputed, gains={}, bridges=bridged)
+    assert commands([], bridged_wrongly) == [
+        f"{again} --reject-pair '{lost},{NAMES[1]}'",
+        anew.format("--mask-path masks"),
+    ]
     said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
     (_, tie_points, _) = advice(said, [lost], [model], 0)
     assert tie_points.why.startswith(
@@ -249,8 +255,11 @@ def test_advice_is_about_what_is_wrong(
     (_, tie_points, _) = advice(given, [lost], [model, model], 0)
     assert tie_points.why.endswith("join two models")
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
+    (disagreeing,) = advice(context, [*NAMES], [], 900)
+    assert "contradict each other" in disagreeing.why
+    monkeypatch.setattr(advice_module, "_share_without_depth", lambda _: 0.95)
     (copies,) = advice(context, [*NAMES], [], 900)
-    assert "from other places" in copies.why
+    assert "show no depth" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
     monkeypatch.setattr(
         Resources, "how_to_complete", lambda *_: "pip install it, or fetch it"

@@ -1,0 +1,126 @@
+"""Pairs with few matches: sure where chance does not explain them, and enough for a model."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_tasks import mapper_of, synthesize, task_with_given_cameras
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import (
+    model_poses,
+    pose_errors,
+    read_poses,
+    relative_pose,
+)
+from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.mappers.few_matches import MAX_RAW, sure_few_matches
+from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+NUM_TARGETS = 14  # fewer than the inliers of a verified pair
+
+
+def without_geometries(path: Path) -> None:
+    with open_database(path) as database:
+        database.clear_two_view_geometries()
+
+
+def targets(path: Path, num_points: int = NUM_TARGETS) -> pycolmap.Reconstruction:
+    """Make a database of five photographs of a few targets, matched and not verified."""
+    truth = synthesize(path, num_rigs=5, num_points3D=num_points)
+    without_geometries(path)
+    return truth
+
+
+def sure_ids(path: Path) -> set[tuple[int, int]]:
+    with open_database(path) as database:
+        return {one.ids for one in sure_few_matches(database, {})}
+
+
+def largest_error_deg(folder: Path, truth: pycolmap.Reconstruction) -> float:
+    found = read_poses(folder)
+    true = model_poses(truth)
+    assert found.keys() == true.keys()
+    errors = [0.0]
+    for first, second in combinations(sorted(found), 2):
+        estimated = relative_pose(found[first], found[second])
+        errors += pose_errors(estimated, relative_pose(true[first], true[second]))
+    return max(errors)
+
+
+def test_few_targets_that_all_agree_make_a_model(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = targets(path)
+    task = task_with_given_cameras(path)
+    (model,) = map_database(
+        mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None
+    )
+    assert len(model.registered_names) == 5
+    assert largest_error_deg(tmp_path / "sparse" / "0", truth) < 0.5
+
+
+def change_matches(path: Path, change: dict[tuple[int, int], Indices]) -> None:
+    with open_database(path) as database:
+        for ids, matches in change.items():
+            database.delete_matches(*ids)
+            database.write_matches(*ids, matches.astype(np.uint32))
+
+
+def test_few_matches_drawn_at_random_are_never_sure(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    targets(path, 200)
+    drawn = np.random.default_rng(0)
+    change = {}
+    for ids in combinations(range(1, 6), 2):
+        features = [drawn.choice(100, NUM_TARGETS, replace=False) for _ in ids]
+        change[ids] = np.stack(features, axis=1)
+    change_matches(path, change)
+    assert sure_ids(path) == set()
+
+
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_seven_matches_are_sure_where_a_third_image_confirms_them(
+    tmp_path: Path, *, is_confirmed: bool
+) -> None:
+    path = tmp_path / "database.db"
+    targets(path)
+    with open_database(path) as database:
+        seven = np.asarray(database.read_matches(1, 2), np.int64)[:7]
+    change = {(1, 2): seven}
+    if not is_confirmed:
+        for other in (3, 4, 5):
+            change[1, other] = seven[:0]
+    change_matches(path, change)
+    assert ((1, 2) in sure_ids(path)) == is_confirmed
+
+
+def test_many_raw_matches_are_not_looked_at(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    targets(path, MAX_RAW + 1)
+    assert sure_ids(path) == set()
+
+
+def test_tie_points_alone_begin_a_model(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = targets(path, 8)
+    tie_points = {}
+    for number, point in enumerate(truth.points3D.values()):
+        seen = {}
+        for element in point.track.elements:
+            seen[truth.images[element.image_id].name] = element.point2D_idx
+        tie_points[f"T{number}"] = seen
+    with open_database(path) as database:
+        database.clear_matches()
+    assert not PairGraph.read(path).pairs
+    with_points = task_with_given_cameras(path, tie_points=tie_points)
+    (model,) = map_database(
+        mapper_of("sparse"), with_points, tmp_path / "sparse", lambda _: None
+    )
+    assert len(model.registered_names) == 5
+    assert len(model.tie_points) == 5 * 8
+    assert largest_error_deg(tmp_path / "sparse" / "0", truth) < 2.0

@@ -1,0 +1,172 @@
+"""Whether what ties photographs is of one place: a poster in two places keeps models apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_tasks import mapper_of, task_with_given_cameras, write_images
+from numpy.typing import NDArray
+from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.reliability import Confidence
+from colmap_affrect.mappers.surroundings import places_of
+from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
+
+NUM_POINTS = 3000
+HERE = (1, 2, 3)  # images of one place
+THERE = (4, 5, 6)
+
+Bools = NDArray[np.bool_]
+Points = NDArray[np.float64]
+IsShared = Callable[[Points], Bools]
+
+
+def poster(points: Points) -> Bools:
+    """Points of a print that hangs on the wall."""
+    return np.asarray((np.abs(points[:, 0] - 3.5) < 1.2) & (np.abs(points[:, 1]) < 1.0))
+
+
+def everything(points: Points) -> Bools:
+    return np.ones(len(points), bool)
+
+
+def each_tenth(points: Points) -> Bools:
+    """Few matches, all over the wall."""
+    return np.asarray(np.arange(len(points)) % 10 == 0)
+
+
+def scene(path: Path, is_shared: IsShared, collage: int = 0) -> pycolmap.Reconstruction:
+    """Write a verified database of six images, and return their model.
+
+    Three see the wall of one place and three that of another one; both see what is shared. A
+    collage sees one place in its left half, and the other one in its right half.
+    """
+    random = np.random.default_rng(2)
+    points = wall(random, NUM_POINTS)
+    shared = is_shared(points)
+    of_first = random.random(NUM_POINTS) < 0.5
+    poses = views(6)
+    keypoints = {}
+    rows = {}  # keypoint of each point, by image
+    for image_id, name in enumerate(poses, 1):
+        pixels = project(points, poses[name])
+        own = of_first if image_id in HERE else ~of_first
+        if image_id == collage:
+            own = np.where(pixels[:, 0] < WIDTH / 2, of_first, ~of_first)
+        seen = np.flatnonzero(is_inside(pixels) & (own | shared))
+        keypoints[image_id] = pixels[seen]
+        rows[image_id] = {int(point): row for row, point in enumerate(seen)}
+    with open_database(path) as database:
+        camera = pycolmap.Camera(
+            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
+        )
+        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
+        write_images(database, camera, poses)
+        for image_id, pixels in keypoints.items():
+            database.write_keypoints(image_id, pixels.astype(np.float32))
+        for first, second in combinations(rows, 2):
+            common = sorted(rows[first].keys() & rows[second].keys())
+            matches = [(rows[first][point], rows[second][point]) for point in common]
+            if not common:
+                continue
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = np.array(matches, np.uint32)
+            database.write_two_view_geometry(first, second, geometry)
+    model = pycolmap.Reconstruction()
+    model.load(PairGraph.read(path).cache)
+    for image_id, name in enumerate(poses, 1):
+        frame = model.images[image_id].frame
+        frame.set_cam_from_world(1, pycolmap.Rigid3d(np.column_stack(poses[name])))
+        model.register_frame(frame.frame_id)
+    for point, position in enumerate(points):
+        seen_by = [image_id for image_id in rows if point in rows[image_id]]
+        if len(seen_by) > 1:
+            track = pycolmap.Track()
+            for image_id in seen_by:
+                track.add_element(image_id, rows[image_id][point])
+            model.add_point3D(position, track)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("is_shared", "places"),
+    [
+        (poster, [{*HERE}, {*THERE}]),
+        (everything, [{*HERE, *THERE}]),
+        (each_tenth, [{*HERE, *THERE}]),
+    ],
+)
+def test_a_poster_in_two_places_is_told_from_matches_all_over(
+    tmp_path: Path, is_shared: IsShared, places: list[set[int]]
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, is_shared)
+    assert places_of(model, PairGraph.read(path)).images == places
+
+
+def map_as_found(path: Path, mapped: MappedModel) -> list[ModelSummary]:
+    """Score and write a model as if a mapper had made it."""
+    mapper = mapper_of("sparse")
+
+    def as_found(*_: Any) -> list[MappedModel]:
+        return [mapped]
+
+    mapper.map = as_found
+    task = task_with_given_cameras(path)
+    return map_database(mapper, task, path.with_name("sparse"), lambda _: None)
+
+
+def nothing(points: Points) -> Bools:
+    return np.zeros(len(points), bool)
+
+
+def test_parts_that_a_collage_alone_ties_are_two_places_and_it_is_doubtful(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, nothing, collage=3)
+    places = places_of(model, PairGraph.read(path))
+    assert (places.images, places.collages) == ([{3, *THERE}, {1, 2}], {3})
+    (first, *_) = map_as_found(path, MappedModel(model))
+    assert first.probabilities["2.jpg"] < DOUBTFUL < first.probabilities["3.jpg"]
+    assert first.doubtful["2.jpg"][0].code == "two_places"
+
+
+def test_bridged_photograph_is_no_surer_than_what_it_hangs_on(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    mapped = MappedModel(scene(path, everything), {"5.jpg": Bridge("4.jpg", 9, 9, 0.1)})
+    task = task_with_given_cameras(path)
+    ties = {f"{number}.jpg": Confidence(0.3, ()) for number in range(5)}
+    alone = {**ties, "5.jpg": Confidence(0.95, ())}
+    held = {**alone, "3.jpg": Confidence(0.97, ())}
+    found = _no_surer_than_ties(alone, mapped, task)
+    assert found["5.jpg"].probability == 0.3
+    assert found["5.jpg"].reasons[0].code == "hangs_on"
+    assert _no_surer_than_ties(held, mapped, task) == held
+
+
+def test_two_places_with_one_poster_are_two_models_and_each_says_why(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    models = map_as_found(path, MappedModel(scene(path, poster)))
+    assert [one.registered_names for one in models] == [
+        ("0.jpg", "1.jpg", "2.jpg"),
+        ("3.jpg", "4.jpg", "5.jpg"),
+    ]
+    apart = models[0].taken_out
+    assert sorted(apart) == ["3.jpg", "4.jpg", "5.jpg"]
+    assert {doubt.code for doubts in apart.values() for doubt in doubts} == {
+        "other_surroundings"
+    }
