@@ -22,10 +22,10 @@ of 8 to 1000 photographs, good for a factor of 2."""
 MIN_ELAPSED_S = 3.0
 
 
-# Of silence, until something says that the work goes on (judged); where lines stay, as in a log,
+# Of silence, until something says that the work goes on (display); where lines stay, as in a log,
 # twice as long after each of them, up to the longest
 QUIET_S = 5.0
-LONGEST_QUIET_S = 60.0
+LONGEST_QUIET_S = 60.0  # Display
 
 
 class Voice:

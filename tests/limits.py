@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the longest file": 550,
+    "lines of the longest file": 555,
     "lines of the longest function": 70,
     "imports between folders": 220,
     "words of ARCHITECTURE.md": 3_100,

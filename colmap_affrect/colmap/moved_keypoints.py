@@ -23,15 +23,16 @@ from colmap_affrect.geometry.epipolar import sampson_errors
 MAX_ERROR_PX = 12.0
 """Of an inlier that fits, or ``MAX_ERROR`` of the longer side: three times what COLMAP verifies
 with by default, so that refined keypoints and coarser limits pass."""
-MAX_ERROR = 0.01
+MAX_ERROR = 0.01  # Longer sides; COLMAP
 # Share of the inliers that fit their own geometry: of a sound pair all, of a mirrored
 # image at most 0.3 (measured)
 MIN_FITTING = 0.5
 MIN_INLIERS = 15  # of a pair that is looked at, as COLMAP verifies pairs by default
-NUM_PAIRS = 12  # of an image that are looked at, to save time
-NUM_SAMPLED = 100  # inliers of a pair that are looked at
-MIN_PAIRS = 2  # that do not fit: of one pair alone nobody knows which image it is
-# Of the pairs of an image that do not fit; of its partners few are such
+NUM_PAIRS = 12  # of an image that are looked at; resource
+NUM_SAMPLED = 100  # inliers of a pair that are looked at; resource
+# That do not fit: of one pair alone nobody knows which image it is; theory
+MIN_PAIRS = 2
+# Of the pairs of an image that do not fit; of its partners few are such; judged
 MIN_SHARE = 0.8
 COLUMNS = "pair_id rows cols data F E H"
 

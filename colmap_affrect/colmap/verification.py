@@ -37,11 +37,12 @@ PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many; resource
 # Of the inliers on a line of writing; where more are, they made it; judged
 MAX_WRITTEN_SHARE = 0.15
 # Raw matches that agree with their neighbours, below which a pair shows nothing in common: 256
-# verified pairs of six scenes had 10 at least, 90 per cent of 374 others had fewer than this
+# verified pairs of six scenes had 10 at least, 90 per cent of 374 others had fewer; measured
 MIN_CONSISTENT = 4
-# Samples that RANSAC draws at most for a pair that shows nothing in common
+# Samples that RANSAC draws at most for a pair that shows nothing in common; resource
 NUM_TRIALS_IN_VAIN = 1000
-MAX_NUM_LOOKED_AT = 300  # raw matches; with more, a pair is searched in any case
+# Raw matches; with more, a pair is searched in any case; resource
+MAX_NUM_LOOKED_AT = 300
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 

@@ -24,9 +24,8 @@ mm and micrometres."""
 PLAUSIBLE_FOCALS = (0.3, 6.0)
 # Ratio of focal lengths that still agree: equivalents are rounded; theory
 MAX_CONTRADICTION = 1.15
-MAX_ASPECT_ERROR = (
-    0.01  # lossless rotation cuts off up to 15 px, shrinking rounds; theory
-)
+# Lossless rotation cuts off up to 15 px, shrinking rounds; theory
+MAX_ASPECT_ERROR = 0.01
 # Photographs of another shape may have been cropped; theory
 SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
 # Longer side of the thumbnails of cameras, often with black bars; format

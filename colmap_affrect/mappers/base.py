@@ -121,6 +121,9 @@ class MappedModel:
     """By the names of images that came in by one verified pair, not by tracks of three images."""
     # Hypotheses that made the model, in the words of a report
     hypotheses: tuple[str, ...] = ()
+    axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
+    """By the names of images: how far rotations change where principal points that points
+    contradict are freed, though that makes no better model."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
 

@@ -30,7 +30,7 @@ MIN_FEW_POINTS = 6
 than determine a pose, each of which chance explains once in a thousand times (theory)."""
 MIN_INIT_SHARE = 0.8
 """Inliers of a first pair, as a share of those of the strongest pair, where none has as many as are
-asked for (judged)."""
+asked for (resource: verification and scores decide)."""
 # Images up to which each new one is followed by a global adjustment; resource
 NUM_ALWAYS_ADJUSTED = 10
 # Of the number of images from one global adjustment to the next; COLMAP has 1.1; resource

@@ -15,6 +15,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers.adjustment import FINAL, MEDIUM
@@ -28,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search
 
 NOISE_FACTORS = 12.0, 6.0, 3.0
-"""Multiples of the noise of keypoints, by which errors count at first (judged: a print whose
+"""Multiples of the noise of keypoints, by which errors count at first (resource: a print whose
 principal point is off by a tenth has errors of some ten px). Half of that or twice as much gives
 the same models."""
 USUAL_LIMIT = 2.0
@@ -136,6 +138,45 @@ def with_shifted_axes(
         iterations=MEDIUM,
     )
     return _restarted(model=changed, search=free, graph=graph, iterations=FINAL)
+
+
+def axis_turns_deg(
+    model: pycolmap.Reconstruction, free: Search, graph: PairGraph
+) -> dict[str, float]:
+    """Return how far rotations change where principal points are freed in a model as it is.
+
+    Args:
+        model: With held principal points; it stays as it is.
+        free: The search with free principal points.
+        graph: Pairs that the model is made from.
+
+    Returns:
+        By image name the median change of its rotations to the others, in degrees.
+    """
+    changed = _restarted(model, free, graph, FINAL)
+    before = _rotations(model)
+    after = _rotations(changed)
+    both = sorted(before.keys() & after.keys())
+    found = dict[str, float]()
+    for image_id in both:
+        turns_deg = []
+        for other in both:
+            if other == image_id:
+                continue
+            old = before[other] * before[image_id].inverse()
+            new = after[other] * after[image_id].inverse()
+            turns_deg.append(math.degrees((new * old.inverse()).angle()))
+        if turns_deg:
+            found[model.images[image_id].name] = float(np.median(turns_deg))
+    return found
+
+
+def _rotations(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rotation3d]:
+    """Return cam_from_world of the registered images, by image id."""
+    found = {}
+    for image_id in model.reg_image_ids():
+        found[image_id] = model.images[image_id].cam_from_world().rotation
+    return found
 
 
 def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:

@@ -82,6 +82,9 @@ class ReliabilityFeatures:
     num_bridge_inliers: int  # of that pair
     direction_sigma_deg: float = 0.0
     """Deviation that the directions of translation to at least half of the others do not exceed."""
+    axis_turn_deg: float = 0.0
+    """How far its rotations to others change with free principal points, where points contradict
+    those that are held and nothing tells where they are."""
 
 
 class _ModelContext:
@@ -184,6 +187,7 @@ def features_of(
             bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
             num_bridge_inliers=len(bridge.matches) if bridge else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
+            axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
         )
     return found
 

@@ -20,6 +20,7 @@ from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOption
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
+    axis_turns_deg,
     contradict_held,
     principal_point_cost,
     with_free_principal_points,
@@ -374,9 +375,12 @@ class _HypothesisTest:
         found = with_own_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         paid = principal_point_cost(found[0].reconstruction, free)  # by the points
-        if score + paid > self.score + MIN_SCORE_GAIN:
+        if score + paid > self.score - MIN_SCORE_GAIN:  # not clearly lower
             self.search = free
             self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
+            return
+        turns_deg = axis_turns_deg(model, free, search.graph)
+        self.best = [replace(self.best[0], axis_turns_deg=turns_deg), *self.best[1:]]
 
     def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""

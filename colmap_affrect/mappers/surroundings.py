@@ -18,33 +18,31 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.model_score import Beta, beta_log_ratio
+from colmap_affrect.mappers.model_score import CHANCE, RIGHT_PAIR, beta_log_ratio
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
 
-GRID = 8  # cells on a side of a photograph, as of scores
+GRID = 8  # cells on a side of a photograph; same as of scores (model_score)
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
 MAX_ANGLE_DEG = 40.0
 """Between the rays of two photographs to a point: beyond, matching loses much (judged)."""
 MAX_ZOOM = 2.2  # ratio of scales, beyond which the same is true (judged)
-HIDDEN = (
-    1.15  # times the depth of a surface before a point, which is hidden then (judged)
-)
-# Of the longer side: surfaces of a photograph are known so far from its points
+# Times the depth of a surface before a point, which is hidden then; judged
+HIDDEN = 1.15
+# Of the longer side: surfaces of a photograph are known so far from its points; judged
 NEIGHBOR_RADIUS = 0.06
-NUM_NEIGHBORS = 3  # whose median depth is that of the surface
-MAX_NUM_POINTS = 500  # of a photograph that are looked at, to save time
-MAX_NUM_PAIRS = 1000  # of a model: larger ones are not looked at, to save time
+NUM_NEIGHBORS = 3  # whose median depth is that of the surface; theory
+MAX_NUM_POINTS = 500  # of a photograph that are looked at; resource
+MAX_NUM_PAIRS = 1000  # of a model: larger ones are not looked at; resource
 CONTRADICTED = -6.0
 """Log-likelihood ratio of one place against two, below which parts are two places: twenty to one,
-where one place is twenty times as probable beforehand."""
-MAX_COMMON = (
-    0.1  # share of the cells of the smaller region that two regions share (judged)
-)
+where one place is twenty times as probable beforehand (theory)."""
+# Share of the cells of the smaller region that two regions share; judged
+MAX_COMMON = 0.1
 MIN_EXPECTED = 8  # cells, an eighth of a photograph: less tells nothing (judged)
 # Shares of expected cells that are found. Measured: 0.85 to 1 of pairs of true scenes, seldom 0.6;
 # 0.22 to 0.54 of pairs that a poster ties
-SAME_PLACE = Beta(14.0, 1.0)
-OTHER_PLACE = Beta(2.0, 4.0)
+SAME_PLACE = RIGHT_PAIR
+OTHER_PLACE = CHANCE
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from colmap_affrect.mappers.tie_points import AGREEING_PX, MIN_NUM_POINTS, TiePo
 
 BY_HAND = "with tie points"  # what made the model, in the words of a report
 MIN_NUM_OF_FIRST = 7
-"""Tie points of two images that begin a model: two more than determine an essential matrix."""
+"""Tie points of two images that begin a model: two more than determine an essential matrix
+(theory)."""
 MAX_SIM3_ERROR = 0.1  # of tie points of two models, in units of their spread (judged)
 
 

@@ -20,6 +20,7 @@ DoubtCode = Literal[
     "tie_points_disagree",
     "bridge_edge",
     "near_others",
+    "axis_unclear",
     "other_surroundings",
     "two_places",
     "hangs_on",
@@ -46,6 +47,10 @@ SENTENCES: dict[DoubtCode, str] = {
     "near_others": (
         "it stands so near to others that the direction between them may be off by "
         "{sigma_deg:.0f} degrees"
+    ),
+    "axis_unclear": (
+        "points say that optical axes are off the middle of photographs, but not where: its "
+        "rotation may be off by {turn_deg:.0f} degrees"
     ),
     "other_surroundings": (
         "what matches is a part of what it shows, as a poster in two places is: its surroundings, "

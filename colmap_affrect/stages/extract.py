@@ -84,9 +84,9 @@ def extract(
     if contents != known:  # those that were there before were seen to be good
         warnings |= inputs.check_names(names)
     mask_warnings = _mask_warnings(inputs, names)
-    extractor = one_image.prepare(
-        recipe.extraction, context.resources, names, context.progress
-    )
+    resources = context.resources
+    progress = context.progress
+    extractor = one_image.prepare(recipe.extraction, resources, names, progress)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     _record(context, inputs, recipe, extractor, later=later or {}, overwrite=overwrite)
@@ -102,8 +102,6 @@ def extract(
     failures = _extract_missing(
         context, inputs, extractor, names=missing, contents=contents, warnings=warnings
     )
-    if failures:
-        require_folder(folder)  # else it has gone with all that was still to come
     _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
@@ -133,6 +131,8 @@ def _check_source(workspace: Workspace, inputs: Inputs) -> None:
 def _require_one_usable(
     folder: Path, names: Sequence[str], failures: Mapping[str, str]
 ) -> None:
+    if failures:
+        require_folder(folder)  # else it has gone with all that was still to come
     if len(failures) == len(names):
         first = failures[names[0]]
         raise ImageError(

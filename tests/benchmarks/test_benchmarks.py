@@ -8,7 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from prints import make_prints
+from synthetic import blobs, centroid
+
+from colmap_affrect.colmap import pycolmap
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(
@@ -56,3 +62,40 @@ def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
         assert 0.0 < sum(run["stages_s"].values()) < run["wall_s"]
     assert "| courtyard:3 | 3 | rectified | " in text
     assert diagram.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("kind", ["crop", "shift", "whole"])
+def test_a_print_has_the_camera_that_is_written_beside_it(
+    tmp_path: Path, kind: str
+) -> None:
+    """A blob on the optical axis is at the principal point of the print."""
+    image_path = tmp_path / "photos"
+    image_path.mkdir()
+    axis_px = np.array([[320.0, 236.0]])  # from the centre of the first pixel
+    photograph = blobs((640, 480), axis_px, 6.0 * np.eye(2))
+    cv2.imwrite(str(image_path / "a.png"), photograph)
+    truth = pycolmap.Reconstruction()
+    params = [700.0, 320.5, 236.5]  # from its corner
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=640, height=480, params=params, camera_id=1
+    )
+    truth.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name="a.png", camera_id=1, image_id=1)
+    truth.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (tmp_path / "truth").mkdir()
+    truth.write_text(str(tmp_path / "truth"))
+    out = tmp_path / "out"
+    make_prints(image_path, tmp_path / "truth", out, kind, step=1, seed=3)
+    (made,) = pycolmap.Reconstruction(str(out / "ground_truth")).cameras.values()
+    seen = cv2.imread(str(out / "images" / "a.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert seen.shape == (made.height, made.width)
+    center = np.array([made.principal_point_x, made.principal_point_y])
+    found = centroid(seen, float(np.median(seen)))
+    assert found + 0.5 == pytest.approx(center, abs=0.15)
+    zoom = made.mean_focal_length() / 700.0
+    offset = center - np.array([made.width, made.height]) / 2.0
+    assert zoom > 1.5
+    if kind == "whole":
+        assert np.abs(offset).max() < 0.02 * made.width
+    else:
+        assert np.abs(offset).max() > 0.02 * made.width

@@ -181,6 +181,11 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     at_one_place = confidence(replace(GOOD, direction_sigma_deg=6.0))
     assert at_one_place.reasons == (Doubt("near_others", {"sigma_deg": 6.0}),)
     assert at_one_place.gain < 0.1  # more matches do not help
+    unclear = confidence(replace(GOOD, axis_turn_deg=6.0))
+    assert unclear.probability == pytest.approx(at_one_place.probability)
+    assert unclear.reasons == (Doubt("axis_unclear", {"turn_deg": 6.0}),)
+    both = confidence(replace(GOOD, direction_sigma_deg=4.8, axis_turn_deg=3.6))
+    assert both.probability == pytest.approx(at_one_place.probability)
     far_off = confidence(replace(GOOD, direction_sigma_deg=60.0))
     assert far_off.probability < 0.01
     assert far_off.of_evidence == pytest.approx(confidence(GOOD).probability)
