@@ -366,9 +366,9 @@ def test_a_folder_that_vanishes_while_a_run_works_is_one_line(
     write_photographs(photos)
     usual = getattr(extract_stage, name)
 
-    def vanish(*given: object) -> object:
+    def vanish(*given: object, **named: object) -> object:
         photos.rename(tmp_path / "gone")
-        return usual(*given)
+        return usual(*given, **named)
 
     monkeypatch.setattr(extract_stage, name, vanish)
     done = call("run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST)
