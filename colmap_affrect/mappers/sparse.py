@@ -273,10 +273,9 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.own = own
-        if any(SHIFTED_AXES in mapped.hypotheses for mapped in task.previous_models):
-            self._begin_with_shifted_axes()
+        self._begin_with_cameras_of(task.previous_models)
         self.best = _restarted(self.search, task.previous_models)
-        self.score = search.best_score(self.best)
+        self.score = self.search.best_score(self.best)
 
     def run(self) -> list[MappedModel]:
         """Return the best models."""
@@ -322,7 +321,8 @@ class _HypothesisTest:
     def _take(
         self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
     ) -> None:
-        before = self.best[0].hypotheses if self.best else ()
+        is_new = hypothesis.name == COLMAP_MODEL
+        before = self.best[0].hypotheses if self.best and not is_new else ()
         hypotheses = _without_duplicates(
             (*before, hypothesis.name, *models[0].hypotheses)
         )
@@ -352,13 +352,17 @@ class _HypothesisTest:
         if found and score > self.score + MIN_SCORE_GAIN:
             self._take(_Hypothesis(COLMAP_MODEL, ()), found, score)
 
-    def _begin_with_shifted_axes(self) -> None:
-        """Go on with what previous models have told of the optical axes."""
-        own = self.own or self.search
-        free = with_free_principal_points(own, self.task.cameras)
-        if free:
-            self.search = free
+    def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
+        """Go on with the cameras, and the optical axes, that models had."""
+        told = set[str]()
+        for mapped in models:
+            told.update(mapped.hypotheses)
+        if self.own and not told.isdisjoint({OWN_CAMERAS, SHIFTED_AXES}):
+            self.search = self.own
             self.own = None
+        if SHIFTED_AXES in told:
+            free = with_free_principal_points(self.search, self.task.cameras)
+            self.search = free or self.search
 
     def _try_shifted_axes(self) -> None:
         """Free the principal points of the best model where its points ask for it."""

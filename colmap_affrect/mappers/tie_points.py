@@ -1,6 +1,7 @@
 """Tie points: what a person has marked in several photographs, as observations of a model.
 
-Models that have two of their images observe them, in all adjustments; filters never take them away.
+Models that have two of their images observe them, again before each adjustment while they are made:
+COLMAP's filters may have taken them away.
 """
 
 import math

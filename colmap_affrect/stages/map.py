@@ -139,7 +139,7 @@ def line_cameras(context: Context) -> dict[str, LineCamera]:
 def unmeasured_pairs(context: Context) -> list[Pair]:
     """Return the pairs whose matches are of local affine frames that were not measured.
 
-    None where no level of the recipe measures frames.
+    There are none where no level of the recipe measures frames.
     """
     is_measured = [level.features.has_shapes for level in context.extraction.levels]
     if not any(is_measured):

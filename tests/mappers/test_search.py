@@ -406,6 +406,12 @@ def two_places(path: Path) -> dict[int, CameraRecord]:
     return {i.camera_id: replace(UNKNOWN, names=(i.name,)) for i in images}
 
 
+def focals_of(mapped: MappedModel) -> list[float]:
+    """Return the focal lengths of the images of a model, rising."""
+    cameras = cameras_of(mapped.reconstruction).values()
+    return sorted(camera.mean_focal_length() for camera in cameras)
+
+
 @pytest.mark.long
 def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     tmp_path: Path,
@@ -417,10 +423,7 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
         OWN_CAMERAS,
         ("with all pairs",),
     )
-    found = sorted(
-        camera.mean_focal_length()
-        for camera in cameras_of(large.reconstruction).values()
-    )
+    found = focals_of(large)
     assert found == pytest.approx(
         [TRUE_FOCAL, TRUE_FOCAL, TRUE_FOCAL, 1.7 * TRUE_FOCAL], rel=0.03
     )
@@ -428,3 +431,5 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     known = replace(task, previous_models=[large, small])
     again = mapper_of("sparse").map(known, tmp_path, 0, lambda _: None)
     assert [model.reconstruction.num_reg_images() for model in again] == [4, 2]
+    focals_px = focals_of(again[0])
+    assert focals_px == pytest.approx(found, rel=0.01)
