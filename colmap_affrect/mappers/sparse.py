@@ -379,7 +379,7 @@ class _HypothesisTest:
         found = with_own_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         paid = principal_point_cost(found[0].reconstruction, free)  # by the points
-        if score + paid > self.score - MIN_SCORE_GAIN:  # not clearly lower
+        if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
             self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
             return

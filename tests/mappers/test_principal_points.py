@@ -94,11 +94,12 @@ def records_of(
     return dict.fromkeys(truth.cameras, record)
 
 
+@pytest.mark.long
 def test_axes_off_the_middle_are_found_and_better_rotations_with_them(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "database.db"
-    truth = write_prints(path, 0.5)
+    truth = write_prints(path, 1.0)
     held_record = replace(UNKNOWN, given=("principal-point",))
     held = mapped(path, records_of(truth, held_record))
     free = mapped(path, records_of(truth, UNKNOWN))
@@ -106,13 +107,22 @@ def test_axes_off_the_middle_are_found_and_better_rotations_with_them(
     assert free.reconstruction.num_reg_images() == NUM_IMAGES
     held_errors_deg = rotation_errors_deg(held.reconstruction, truth)
     free_errors_deg = rotation_errors_deg(free.reconstruction, truth)
-    assert max(held_errors_deg) > 8.0
-    assert max(free_errors_deg) < 5.0
+    assert max(free_errors_deg) < 0.6 * max(held_errors_deg)
     for image in free.reconstruction.images.values():
-        true_center = np.array(SIZE) / 2.0 + 0.5 * OFFSETS_PX[image.image_id - 1]
-        assert np.abs(center_of(image.camera) - true_center).max() < 35.0
-        focal_px = image.camera.mean_focal_length()
-        assert focal_px == pytest.approx(TRUE_FOCAL_PX, rel=0.05)
+        true_center = np.array(SIZE) / 2.0 + OFFSETS_PX[image.image_id - 1]
+        assert np.abs(center_of(image.camera) - true_center).max() < 80.0
+
+
+def test_rotations_are_unclear_where_free_axes_make_no_better_model(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    truth = write_prints(path, 0.5)
+    model = mapped(path, records_of(truth, UNKNOWN))
+    assert SHIFTED_AXES not in model.hypotheses
+    turns_deg = model.axis_turns_deg
+    assert len(turns_deg) == NUM_IMAGES
+    assert 2.0 < min(turns_deg.values()) < max(turns_deg.values()) < 20.0
 
 
 @pytest.mark.parametrize(
@@ -130,19 +140,23 @@ def test_axes_stay_where_they_are_in_the_middle_or_given(
     truth = write_prints(path, share)
     model = mapped(path, records_of(truth, record))
     assert SHIFTED_AXES not in model.hypotheses
+    assert not model.axis_turns_deg
     for camera in model.reconstruction.cameras.values():
         assert not is_off_center(camera)
 
 
+@pytest.mark.long
 def test_a_model_with_free_axes_is_gone_on_with_as_such(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
-    truth = write_prints(path, 0.5)
+    truth = write_prints(path, 1.0)
     records = records_of(truth, UNKNOWN)
     first = mapped(path, records)
     task = MappingTask(path, None, previous_models=[first], cameras=records)
     (again,) = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     assert SHIFTED_AXES in again.hypotheses
-    assert max(rotation_errors_deg(again.reconstruction, truth)) < 5.0
+    before_deg = rotation_errors_deg(first.reconstruction, truth)
+    after_deg = rotation_errors_deg(again.reconstruction, truth)
+    assert after_deg == pytest.approx(before_deg, abs=0.5)
 
 
 def test_an_axis_that_mapping_moved_has_the_prior_of_a_print() -> None:
