@@ -252,13 +252,10 @@ class Progress:
                 elif text:
                     show(text, file=stream)
 
-        thread = threading.Thread(target=listen, daemon=True)
-        thread.start()
         try:
-            yield
+            with _in_background(listen, is_over):
+                yield
         finally:
-            is_over.set()
-            thread.join()
             if longest:
                 stream.write(f"\r{' ' * longest}\r")
 
@@ -274,7 +271,16 @@ def _refresh_each_second(bar: tqdm, voice: Voice, title: str) -> Iterator[None]:
             bar.refresh()
             voice.heard(title)
 
-    thread = threading.Thread(target=tick, daemon=True)
+    with _in_background(tick, is_over):
+        yield
+
+
+@contextmanager
+def _in_background(
+    work: Callable[[], None], is_over: threading.Event
+) -> Iterator[None]:
+    """Have another thread work for as long as the context lasts, until an event tells it to end."""
+    thread = threading.Thread(target=work, daemon=True)
     thread.start()
     try:
         yield

@@ -13,7 +13,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.mappers.model_score import GRID
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, num_matched_images
 
 NUM_POSE_PARAMETERS = 6  # theory
 MIN_NUM_IMAGES = 3
@@ -27,7 +27,9 @@ def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
     """Return the ids of the cameras whose distortion the verified pairs of a graph tell."""
     redundancies: defaultdict[int, float] = defaultdict(float)
     num_images: defaultdict[int, int] = defaultdict(int)
-    for image_id, num_partners in _num_partners(graph).items():
+    num_keypoints = {i: len(points) for i, points in graph.keypoints.items()}
+    matched = num_matched_images(num_keypoints, graph.verified)
+    for image_id, num_partners in matched.items():
         camera = graph.cameras[image_id]
         key = camera.camera_id
         keypoints = graph.keypoints[image_id].astype(np.float64)
@@ -38,17 +40,6 @@ def cameras_that_tell_distortion(graph: PairGraph) -> frozenset[int]:
         if num_images[key] >= MIN_NUM_IMAGES or redundancy >= MIN_REDUNDANCY:
             found.add(key)
     return frozenset(found)
-
-
-def _num_partners(graph: PairGraph) -> dict[int, Indices]:
-    """Return in how many other images each feature is matched, by image id."""
-    found = {
-        i: np.zeros(len(points), np.int64) for i, points in graph.keypoints.items()
-    }
-    for pair in graph.verified:
-        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
-            found[image_id][np.unique(features)] += 1
-    return found
 
 
 def redundancy_of(

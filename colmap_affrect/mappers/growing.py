@@ -144,6 +144,19 @@ class Grower:
             poses_of(model), cameras_of(model), pycolmap.Reconstruction()
         )
 
+    def remake(
+        self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
+    ) -> pycolmap.Reconstruction:
+        """Return a new model that begins with the poses and cameras of another one, adjusted.
+
+        Args:
+            model: It stays as it is.
+            max_iterations: Of each adjustment; by default until it converges.
+        """
+        changed = self.restart_from(model)
+        self.adjust_fully(changed, max_iterations)
+        return changed
+
     def register_at(
         self, poses: PoseById, cameras: CameraById, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:

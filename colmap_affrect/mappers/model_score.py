@@ -23,6 +23,7 @@ from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     VerifiedPair,
     cameras_of,
+    num_matched_images,
     poses_of,
 )
 
@@ -107,14 +108,9 @@ class ModelScorer:
 
     def _num_partners(self, model: pycolmap.Reconstruction) -> dict[int, Indices]:
         """Return in how many other images of the model each feature is matched, by image id."""
-        inside = self.graph.keypoints.keys() & set(model.reg_image_ids())
-        found = {
-            i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)
-        }
-        for pair in self.graph.pairs_inside(found):
-            for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
-                found[image_id][np.unique(features)] += 1
-        return found
+        inside = sorted(self.graph.keypoints.keys() & set(model.reg_image_ids()))
+        num_keypoints = {i: len(self.graph.keypoints[i]) for i in inside}
+        return num_matched_images(num_keypoints, self.graph.pairs_inside(inside))
 
 
 def num_occupied_cells(camera: pycolmap.Camera, points: Floats) -> int:

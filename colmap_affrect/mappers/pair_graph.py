@@ -370,6 +370,29 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
     return {i: model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()}
 
 
+def used_cameras(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of the registered images by camera id."""
+    return {camera.camera_id: camera for camera in cameras_of(model).values()}
+
+
+def num_matched_images(
+    num_keypoints: Mapping[int, int], pairs: Iterable[VerifiedPair]
+) -> dict[int, Indices]:
+    """Return in how many other images each feature is matched, by image id.
+
+    Args:
+        num_keypoints: Of each image.
+        pairs: Pairs of these images.
+    """
+    found = {}
+    for image_id, number in num_keypoints.items():
+        found[image_id] = np.zeros(number, np.int64)
+    for pair in pairs:
+        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+            found[image_id][np.unique(features)] += 1
+    return found
+
+
 def has_rigs(model: pycolmap.Reconstruction) -> bool:
     """Tell whether a model has a rig of several sensors."""
     return any(rig.num_sensors() > 1 for rig in model.rigs.values())

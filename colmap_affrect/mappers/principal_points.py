@@ -26,7 +26,7 @@ from colmap_affrect.mappers.camera_priors import (
     shifted_principal_point,
 )
 from colmap_affrect.mappers.focal_observability import with_fewer_points
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
 
 NOISE_FACTORS = 12.0, 6.0, 3.0
@@ -96,7 +96,7 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
     held_cost = _lowest_cost(model, held)
     free_cost = _lowest_cost(model, free)
     num_freed = 0
-    for key in {camera.camera_id for camera in cameras_of(model).values()}:
+    for key in used_cameras(model):
         prior = free.adjuster.priors[key]
         if prior.principal_point and not held.adjuster.priors[key].principal_point:
             num_freed += 1
@@ -134,16 +134,10 @@ def with_shifted_axes(
         )
     for factor in NOISE_FACTORS:
         coarse = _coarser(_with_priors(free, straight), factor)
-        changed = _restarted(
-            model=changed, search=coarse, graph=graph, iterations=MEDIUM
-        )
-    changed = _restarted(
-        model=changed,
-        search=_with_priors(free, straight),
-        graph=graph,
-        iterations=MEDIUM,
-    )
-    return _restarted(model=changed, search=free, graph=graph, iterations=FINAL)
+        changed = coarse.grower(graph).remake(changed, MEDIUM)
+    fine = _with_priors(free, straight)
+    changed = fine.grower(graph).remake(changed, MEDIUM)
+    return free.grower(graph).remake(changed)
 
 
 def axis_turns_deg(
@@ -159,7 +153,7 @@ def axis_turns_deg(
     Returns:
         By image name the median change of its rotations to the others, in degrees.
     """
-    changed = _restarted(model, free, graph, FINAL)
+    changed = free.grower(graph).remake(model)
     before = _rotations(model)
     after = _rotations(changed)
     both = sorted(before.keys() & after.keys())
@@ -188,7 +182,7 @@ def _rotations(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rotation3d]
 def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
     """Return how much the free principal points of a model cost, in nats."""
     total = 0.0
-    for camera in {c.camera_id: c for c in cameras_of(model).values()}.values():
+    for camera in used_cameras(model).values():
         prior = search.adjuster.priors[camera.camera_id].principal_point
         if prior:
             total += prior.cost(camera.principal_point_x, camera.principal_point_y)
@@ -197,20 +191,10 @@ def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> floa
 
 def _straighten(model: pycolmap.Reconstruction, search: Search) -> None:
     """Take the distortion of unknown cameras away, in place."""
-    for camera in {c.camera_id: c for c in cameras_of(model).values()}.values():
+    for camera in used_cameras(model).values():
         if search.adjuster.priors[camera.camera_id].is_unknown:
             for index in camera.extra_params_idxs():
                 camera.params[index] = 0.0
-
-
-def _restarted(
-    model: pycolmap.Reconstruction, search: Search, graph: PairGraph, iterations: int
-) -> pycolmap.Reconstruction:
-    """Return a model with the poses and cameras of another one, and points of its own."""
-    grower = search.grower(graph)
-    changed = grower.restart_from(model)
-    grower.adjust_fully(changed, iterations)
-    return changed
 
 
 def _coarser(search: Search, factor: float) -> Search:

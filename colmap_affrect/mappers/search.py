@@ -20,7 +20,12 @@ from colmap_affrect.mappers.bridging import BridgeFinder
 from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, VerifiedPair, cameras_of
+from colmap_affrect.mappers.pair_graph import (
+    Ids,
+    PairGraph,
+    VerifiedPair,
+    used_cameras,
+)
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 SHARED_SIGMA = 0.1
@@ -237,7 +242,7 @@ class Search:
 
     def _unknown_focals(self, model: pycolmap.Reconstruction) -> dict[int, float]:
         """Return the focal lengths of the used cameras whose prior is unknown, by camera id."""
-        used = {camera.camera_id: camera for camera in cameras_of(model).values()}
+        used = used_cameras(model)
         return {
             k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()
         }

@@ -343,9 +343,7 @@ class _HypothesisTest:
         grower = search.grower(search.graph)
         found = list[MappedModel]()
         for mapped in models[:NUM_COLMAP_MODELS]:
-            model = grower.restart_from(mapped.reconstruction)
-            grower.adjust_fully(model)
-            found.append(MappedModel(model))
+            found.append(MappedModel(grower.remake(mapped.reconstruction)))
         found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
@@ -429,8 +427,7 @@ def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedMo
     grower = search.grower(search.graph)
     found = list[MappedModel]()
     for mapped in previous:
-        model = grower.restart_from(mapped.reconstruction)
-        grower.adjust_fully(model)
+        model = grower.remake(mapped.reconstruction)
         hypotheses = _without_duplicates((*mapped.hypotheses, AGAIN))
         found.append(replace(mapped, reconstruction=model, hypotheses=hypotheses))
     return with_own_images(found)
@@ -457,10 +454,7 @@ def _with_own_cameras(
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if own_score <= shared_score + MIN_SCORE_GAIN:
             return None
-    grower = own.grower(graph)
-    changed = grower.restart_from(model)
-    grower.adjust_fully(changed)
-    return changed
+    return own.grower(graph).remake(model)
 
 
 def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
