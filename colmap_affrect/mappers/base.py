@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.geometry.lines import LineCamera
     from colmap_affrect.mappers.existing import ExistingModel
+    from colmap_affrect.mappers.pair_graph import PairGraph
     from colmap_affrect.project.report import Bridge
 
 
@@ -76,6 +77,9 @@ class MappingTask:
     may_share: bool = False
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    # graphs that pair_graph.graph_of has read, by database and fewest inliers of a pair;
+    # tasks that ``replace`` makes of this one share them
+    graphs: dict[tuple[Path, int], PairGraph] = field(default_factory=dict, repr=False)
 
     @property
     def colors_path(self) -> Path:

@@ -71,7 +71,7 @@ def _correspondences(
 ) -> pycolmap.CorrespondenceGraph:
     """Return the inliers of the pairs among a model's images, but for those it contradicts."""
     inside = set(model.reg_image_ids())
-    against = graph.contradicted(model)
+    against = graph.contradicted_verified(model)
     found = pycolmap.CorrespondenceGraph()
     for image_id in sorted(inside):
         found.add_image(image_id, model.images[image_id].num_points2D())

@@ -2,10 +2,10 @@
 
 import copy
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -261,8 +261,7 @@ class PairGraph:
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
         """Return the pairs both of whose images are among some."""
-        inside = set(image_ids)
-        return [pair for pair in self.pairs if inside.issuperset(pair.ids)]
+        return _pairs_among(self.pairs, image_ids)
 
     def agreement(
         self, pair: VerifiedPair, poses: PoseById, cameras: CameraById
@@ -297,10 +296,19 @@ class PairGraph:
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
+        return self._contradicted(self.pairs, model)
+
+    def contradicted_verified(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
+        """Return the same of all verified pairs, also those not among the strongest."""
+        return self._contradicted(self.verified, model)
+
+    def _contradicted(
+        self, pairs: Pairs, model: pycolmap.Reconstruction
+    ) -> frozenset[Ids]:
         poses = poses_of(model)
         cameras = cameras_of(model)
         found = set[Ids]()
-        for pair in self.pairs_inside(poses):
+        for pair in _pairs_among(pairs, poses):
             if self.agreement(pair, poses, cameras) < MIN_SHARE:
                 found.add(pair.ids)
         return frozenset(found)
@@ -350,10 +358,17 @@ class PairGraph:
         return candidates
 
 
-@lru_cache(maxsize=1)
 def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
-    """Return the graph of what is to be mapped; what was asked for last is not read again."""
-    return PairGraph.read(task.database_path, min_num_matches)
+    """Return the graph of what is to be mapped; it is read once for a task.
+
+    Args:
+        task: Names the database. Tasks that ``replace`` makes of it have the same graph.
+        min_num_matches: Pairs with fewer inliers are left out.
+    """
+    key = task.database_path, min_num_matches
+    if key not in task.graphs:
+        task.graphs[key] = PairGraph.read(*key)
+    return task.graphs[key]
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
@@ -376,20 +391,32 @@ def used_cameras(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
 
 
 def num_matched_images(
-    num_keypoints: Mapping[int, int], pairs: Iterable[VerifiedPair]
+    num_keypoints: Mapping[int, int],
+    pairs: Iterable[VerifiedPair],
+    viewpoint_of: Mapping[int, int] | None = None,
 ) -> dict[int, Indices]:
     """Return in how many other images each feature is matched, by image id.
 
     Args:
         num_keypoints: Of each image.
         pairs: Pairs of these images.
+        viewpoint_of: Of images from the same viewpoint, which count as one, a common number by
+            image id; others have none.
     """
+    viewpoint_of = viewpoint_of or {}
+    matched = defaultdict[tuple[int, int], list[Indices]](list)
+    for pair in pairs:
+        first, second = pair.ids
+        viewpoint1 = viewpoint_of.get(first, first)
+        viewpoint2 = viewpoint_of.get(second, second)
+        if viewpoint1 != viewpoint2:
+            matched[first, viewpoint2].append(pair.matches[:, 0])
+            matched[second, viewpoint1].append(pair.matches[:, 1])
     found = {}
     for image_id, number in num_keypoints.items():
         found[image_id] = np.zeros(number, np.int64)
-    for pair in pairs:
-        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
-            found[image_id][np.unique(features)] += 1
+    for (image_id, _), features in matched.items():
+        found[image_id][np.unique(np.concatenate(features))] += 1
     return found
 
 
@@ -450,6 +477,13 @@ def _read_pairs(
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             verified.append(VerifiedPair(ids, matches, geometry))
     return verified
+
+
+def _pairs_among(
+    pairs: Iterable[VerifiedPair], image_ids: Collection[int]
+) -> list[VerifiedPair]:
+    inside = set(image_ids)
+    return [pair for pair in pairs if inside.issuperset(pair.ids)]
 
 
 def _images_of(pairs: Iterable[VerifiedPair]) -> set[int]:

@@ -30,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
     sampling_step,
 )
-from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs, viewpoints
 from colmap_affrect.mappers.tie_points import (
     TiePoints,
     tie_point_log_odds,
@@ -113,11 +113,17 @@ class _ModelContext:
             for image_id in pair.ids:
                 self.pairs_of[image_id].append(pair)
         self.pairs_of_frames = self._pairs_of_frames()
-        self.same_viewpoint = same_viewpoint_pairs(self.graph, task.image_path)
+        same_viewpoint = same_viewpoint_pairs(self.graph, task.image_path)
+        self.viewpoint_of = viewpoints(same_viewpoint)
 
     def frame_of(self, image_id: int) -> int:
         """Return the frame of an image: all that a rig took at once is one."""
         return self.model.images[image_id].frame_id
+
+    def is_of_one_viewpoint(self, pair: VerifiedPair) -> bool:
+        """Tell whether both images of a pair were taken from the same viewpoint."""
+        viewpoint1, viewpoint2 = (self.viewpoint_of.get(i, i) for i in pair.ids)
+        return viewpoint1 == viewpoint2
 
     def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
         """Return the pairs of each frame with others: poses inside a rig hold each other."""
@@ -149,8 +155,10 @@ def features_of(
     context = _ModelContext(mapped, task)
     if growths is None:
         growths = focal_growths(context.model, task)
-    track_log_ratios = context.scorer.track_log_ratios(context.model)
-    num_three_view_points = _num_three_view_points(context)
+    track_log_ratios = context.scorer.track_log_ratios(
+        context.model, context.viewpoint_of
+    )
+    num_three_view_points = num_long_tracks(context.model, context.viewpoint_of)
     rotation_ratios = _rotation_ratios(context)
     originals = _mirrored_originals(context)
     fitting_focals_px = fitting_focals(context.model, task, context.priors)
@@ -196,28 +204,24 @@ def _pair_log_ratio(context: _ModelContext, image_id: int) -> float:
     """Return the log-likelihood ratio of an image by its pairs from other viewpoints."""
     total = 0.0
     for pair in context.pairs_of[image_id]:
-        if pair.ids not in context.same_viewpoint:
+        if not context.is_of_one_viewpoint(pair):
             num = context.scorer.num_cells(pair)
             total += pair_log_ratio(context.agreements[pair.ids] * num, num)
     return total
 
 
 def _agreeing_share(context: _ModelContext, image_id: int) -> float:
-    """Return the share of the inliers of an image's pairs that agree with the model."""
-    pairs = context.pairs_of[image_id]
-    if not pairs:
-        return 1.0
-    shares = [context.agreements[pair.ids] for pair in pairs]
-    weights = [len(pair.matches) for pair in pairs]
-    return float(np.average(shares, weights=weights))
+    """Return the share of the inliers of an image's pairs that agree with the model.
 
-
-def _num_three_view_points(context: _ModelContext) -> Mapping[int, int]:
-    """Return the number of points of three viewpoints, by image id."""
-    viewpoint_of = dict[int, int]()
-    for first, second in sorted(context.same_viewpoint):
-        viewpoint_of[second] = viewpoint_of.get(first, first)
-    return num_long_tracks(context.model, viewpoint_of)
+    Pairs from one viewpoint say nothing of the pose; an image without others has a share of 1.
+    """
+    shares = list[float]()
+    weights = list[int]()
+    for pair in context.pairs_of[image_id]:
+        if not context.is_of_one_viewpoint(pair):
+            shares.append(context.agreements[pair.ids])
+            weights.append(len(pair.matches))
+    return float(np.average(shares, weights=weights)) if shares else 1.0
 
 
 def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:

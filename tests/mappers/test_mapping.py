@@ -30,12 +30,13 @@ from colmap_affrect.colmap.model_files import (
     relative_pose,
 )
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers import mapping, snapshots
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
@@ -318,3 +319,22 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
     assert len(model.registered_names) == num_images
     assert len(model.doubtful) == (num_images == 3)
     assert len(model.taken_out) == (num_images == 2)
+
+
+def test_verified_pairs_are_read_once_also_where_there_are_snapshots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=100)
+    monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
+    read = PairGraph.read
+    num_read = list[Path]()
+
+    def counted(path: Path, min_num_matches: int) -> PairGraph:
+        num_read.append(path)
+        return read(path, min_num_matches)
+
+    monkeypatch.setattr(PairGraph, "read", counted)
+    ((model,), _) = reconstruct(path, mapper_of("sparse"))
+    assert len(model.registered_names) == 3
+    assert num_read == [path]

@@ -14,6 +14,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
+from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import CameraPrior
@@ -63,6 +64,25 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(
     features = features_of(mapped, task)[image.name]
     assert features.agreement < 0.2
     assert features.log_likelihood_ratio < 0.0
+
+
+def test_an_image_from_the_same_viewpoint_does_not_agree_with_a_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third photograph is in a wrong place; the others are from one viewpoint."""
+    mapped, task = scene(tmp_path, 3)
+    image = last(mapped)
+    turn = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3])
+    )
+    image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    first, second, _ = sorted(mapped.reconstruction.reg_image_ids())
+    name = mapped.reconstruction.images[first].name
+    assert features_of(mapped, task)[name].agreement > 0.4
+    monkeypatch.setattr(
+        reliability_features, "same_viewpoint_pairs", lambda *_: {(first, second)}
+    )
+    assert features_of(mapped, task)[name].agreement < 0.2
 
 
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
@@ -244,7 +264,7 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
     assert (
         min(
             one.pure_rotation_ratio
-            for one in features_of(mapped, replace(task)).values()
+            for one in features_of(mapped, replace(task, graphs={})).values()
         )
         > 0.9
     )
