@@ -5,8 +5,9 @@ focal length and distortion from their priors. COLMAP's own adjustment has no su
 few points are seen by many images, its focal lengths run away.
 """
 
+import copy
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,12 +161,29 @@ class Adjuster:
     constant_frames: frozenset[int] = frozenset()
     tie_points: TiePoints = NONE  # observed by all models that have two of their images
 
-    def set_initial_focals(self, model: pycolmap.Reconstruction) -> None:
-        """Give the cameras of a model that are not fixed the focal lengths of their priors."""
+    def set_initial_focals(
+        self, model: pycolmap.Reconstruction, used: Collection[int] = ()
+    ) -> None:
+        """Give the cameras of a model that are not fixed the focal lengths of their priors.
+
+        Args:
+            model: Changed in place.
+            used: Ids of the cameras that stay as they are.
+        """
         for key, camera in model.cameras.items():
-            prior = self.priors.get(key)
-            if prior and prior.sigma and key not in self.constant:
-                camera.params[list(camera.focal_length_idxs())] = prior.focal_px
+            if key not in used:
+                self._set_initial_focal(camera)
+
+    def initial_camera(self, camera: pycolmap.Camera) -> pycolmap.Camera:
+        """Return a camera of the database as models begin with it, by its prior."""
+        initial = copy.copy(camera)
+        self._set_initial_focal(initial)
+        return initial
+
+    def _set_initial_focal(self, camera: pycolmap.Camera) -> None:
+        prior = self.priors.get(camera.camera_id)
+        if prior and prior.sigma and camera.camera_id not in self.constant:
+            camera.params[list(camera.focal_length_idxs())] = prior.focal_px
 
     def adjust(
         self,

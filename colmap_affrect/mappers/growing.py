@@ -164,7 +164,8 @@ class Grower:
 
         Args:
             poses: cam_from_world by image id; images that the model has already stay.
-            cameras: Cameras of these images, taken over where the model has not used them yet.
+            cameras: Cameras of these images, taken over where the model has not used them yet;
+                others that it has not used begin with their priors.
             model: Changed in place; may be empty.
 
         Returns:
@@ -172,6 +173,7 @@ class Grower:
         """
         used = {model.images[i].camera_id for i in model.reg_image_ids()}
         model.load(self.graph.cache)
+        self.adjuster.set_initial_focals(model, used)
         for image_id, (rotation, translation) in poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:

@@ -34,7 +34,7 @@ SHARED_SIGMA = 0.1
 SAME_FOCAL = 0.03
 """Largest difference of the logarithms of two focal lengths, of which bridges that were built with
 one are right with the other (judged)."""
-NUM_STARTS = 3  # models from which bridges are built in turn (resource)
+NUM_BRIDGED_MODELS = 3  # models from which bridges are built in turn (resource)
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,11 @@ class Search:
     native: pycolmap.IncrementalPipelineOptions
     num_seeds: int  # first pairs in a row that may bring nothing
     show: Callable[[int], None]  # is told how many images a model has
-    num_starts: int = NUM_STARTS
-    """Models from which bridges are built in turn; with 0 there are none, and one focal length."""
+    num_bridged_models: int = NUM_BRIDGED_MODELS  # from which bridges are built in turn
+    builds_bridges: bool = True  # otherwise images that tracks do not register are left
+    tries_focals: bool = (
+        True  # otherwise models begin with the likeliest focal lengths only
+    )
 
     @property
     def graph(self) -> PairGraph:
@@ -85,7 +88,10 @@ class Search:
             model = attempt.models[0].reconstruction
             if attempt.score > best.score:
                 best = attempt
-                if search in initial and not attempt.agrees:
+                is_open = not attempt.agrees or self._lacks_bridges(
+                    search, graph, model
+                )
+                if search in initial and is_open:
                     pending.insert(0, self._with_focals_of(model))
             if self.is_certain(model, graph, agrees=attempt.agrees):
                 break
@@ -93,6 +99,14 @@ class Search:
         for mapped in best.models:
             grower.adjust_fully(mapped.reconstruction)
         return best.models
+
+    def _lacks_bridges(
+        self, search: Self, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> bool:
+        """Tell whether bridges may improve a model that another search made without them."""
+        if search.builds_bridges or not self.builds_bridges:
+            return False
+        return bool(graph.unexplained_by(model))
 
     def extend_models(
         self, graph: PairGraph, known: Sequence[MappedModel]
@@ -132,12 +146,14 @@ class Search:
         """
         if not models:
             return []
-        if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):
+        if not self.builds_bridges or not graph.unexplained_by(
+            models[0].reconstruction
+        ):
             return [models[0]]
         grower = self.grower(graph)
-        bridges = BridgeFinder(graph, self.native.random_seed)
+        bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
         joined = list[MappedModel]()
-        for mapped in models[: self.num_starts]:
+        for mapped in models[: self.num_bridged_models]:
             joined.append(register_bridges(mapped, bridges, grower, self.scorer))
         return with_own_images([max(joined, key=self._score), *models])
 
@@ -179,16 +195,17 @@ class Search:
     def _with_initial_focals(self) -> list[Self]:
         """Return searches with several values of unknown focal lengths, the likeliest first.
 
-        Where no images share a camera, only the first one builds bridges, to save time.
+        Where no images share a camera, only the first one builds bridges, to save time; another
+        one that wins is repeated with bridges.
         """
         numbers = [len(prior.starts_px) for prior in self.unknown.values()]
         searches = [self._with_start(0)]
-        if self.num_starts:
+        if self.tries_focals:
             for number in range(1, max(numbers, default=1)):
                 search = self._with_start(number)
-                searches.append(
-                    search if self._shared else replace(search, num_starts=0)
-                )
+                if not self._shared:
+                    search = replace(search, builds_bridges=False)
+                searches.append(search)
         return searches
 
     def _with_start(self, number: int) -> Self:
@@ -255,11 +272,18 @@ class Search:
         scores: dict[frozenset[int], float] = {}
         best_score = 0.0
         num_in_vain = 0
+        num_failed = 0
         pairs = first_pairs(first, graph)
         with closing(
             _grow_in_order(self.grower(graph), [pair.ids for pair in pairs])
         ) as grown:
             for model in grown:
+                if model is None:
+                    num_failed += 1
+                    if num_failed >= self.native.init_num_trials:
+                        break
+                    continue
+                num_failed = 0
                 score = self.scorer.score(model)
                 num_in_vain = (
                     0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
@@ -309,7 +333,10 @@ def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
 
 def _grow_in_order(
     grower: Grower, pairs: Sequence[Ids]
-) -> Generator[pycolmap.Reconstruction, None, None]:
-    """Yield models that grow from pairs: in threads after the first, which often is enough."""
-    yield from filter(None, map(grower.grow, pairs[:1]))
-    yield from filter(None, map_ordered(grower.grow, pairs[1:], available_cores()))
+) -> Generator[pycolmap.Reconstruction | None, None, None]:
+    """Yield models that grow from pairs, None of one that makes none.
+
+    They grow in threads after the first, which often is enough.
+    """
+    yield from map(grower.grow, pairs[:1])
+    yield from map_ordered(grower.grow, pairs[1:], available_cores())

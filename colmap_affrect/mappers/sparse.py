@@ -111,7 +111,7 @@ class SparseMapper(IncrementalMapper):
                 native.mapper.init_max_forward_motion = 1.0
             return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
-        search = replace(search, num_starts=1)
+        search = replace(search, num_bridged_models=1)
         if task.previous_models:
             found = _restarted(search, task.previous_models)
         else:
@@ -285,7 +285,7 @@ class _HypothesisTest:
             models = self._built(hypothesis)
             score = self.search.best_score(models)
             if models and (not self.best or score > self.score):
-                self._take(hypothesis, models, score)
+                self._take(models, score)
                 self._try_own_cameras(hypothesis)
         if not self._is_certain():
             self._try_colmap()
@@ -310,23 +310,22 @@ class _HypothesisTest:
         return self.search.is_certain(self.best[0].reconstruction, self.search.graph)
 
     def _built(self, hypothesis: _Hypothesis) -> list[MappedModel]:
-        """Return the models of a hypothesis, none where it explains no more than the best ones."""
+        """Return the models of a hypothesis, none where it explains no more than the best ones.
+
+        Models that were known before are adjusted with its pairs, too, so that all of them have
+        its name, each after the hypotheses that made it before.
+        """
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
-            return _of_some_tracks(self.search, graph) or self.search.best(graph)
+            models = _of_some_tracks(self.search, graph) or self.search.best(graph)
+            return _made_by(hypothesis.name, models)
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
-        return self.search.extend_models(graph, self.best)
+        models = self.search.extend_models(graph, self.best)
+        return [_also_by(hypothesis.name, mapped) for mapped in models]
 
-    def _take(
-        self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
-    ) -> None:
-        is_new = hypothesis.name == COLMAP_MODEL
-        before = self.best[0].hypotheses if self.best and not is_new else ()
-        hypotheses = _without_duplicates(
-            (*before, hypothesis.name, *models[0].hypotheses)
-        )
-        self.best = [replace(mapped, hypotheses=hypotheses) for mapped in models]
+    def _take(self, models: Sequence[MappedModel], score: float) -> None:
+        self.best = list(models)
         self.score = score
 
     def _try_colmap(self) -> None:
@@ -348,7 +347,7 @@ class _HypothesisTest:
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
-            self._take(_Hypothesis(COLMAP_MODEL, ()), found, score)
+            self._take(_made_by(COLMAP_MODEL, found), score)
 
     def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
         """Go on with the cameras, and the optical axes, that models had."""
@@ -372,14 +371,16 @@ class _HypothesisTest:
         if free is None or not contradict_held(model, search, free):
             return
         changed = with_shifted_axes(model, free, search.graph)
-        changed_model = replace(self.best[0], reconstruction=changed)
+        changed_model = _also_by(
+            SHIFTED_AXES, replace(self.best[0], reconstruction=changed)
+        )
         found = free.with_bridges(search.graph, [changed_model])
         found = with_own_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         paid = principal_point_cost(found[0].reconstruction, free)  # by the points
         if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
-            self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
+            self._take(found, score)
             return
         turns_deg = axis_turns_deg(model, free, search.graph)
         self.best = [replace(self.best[0], axis_turns_deg=turns_deg), *self.best[1:]]
@@ -393,9 +394,7 @@ class _HypothesisTest:
         model = _with_own_cameras(self.own, graph, self.search, first.reconstruction)
         if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
             return
-        changed = replace(
-            first, reconstruction=model, hypotheses=(*first.hypotheses, OWN_CAMERAS)
-        )
+        changed = _also_by(OWN_CAMERAS, replace(first, reconstruction=model))
         self.best = with_own_images([changed, *self.best[1:]])
         self.search = self.own
         self.own = None
@@ -418,8 +417,19 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _without_duplicates(hypotheses: Sequence[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(hypotheses))
+def _made_by(name: str, models: Sequence[MappedModel]) -> list[MappedModel]:
+    """Return models with the name of a hypothesis before those that each of them has."""
+    found = list[MappedModel]()
+    for mapped in models:
+        hypotheses = tuple(dict.fromkeys((name, *mapped.hypotheses)))
+        found.append(replace(mapped, hypotheses=hypotheses))
+    return found
+
+
+def _also_by(name: str, mapped: MappedModel) -> MappedModel:
+    """Return a model with the name of a hypothesis after those that it has."""
+    hypotheses = tuple(dict.fromkeys((*mapped.hypotheses, name)))
+    return replace(mapped, hypotheses=hypotheses)
 
 
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
@@ -428,8 +438,7 @@ def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedMo
     found = list[MappedModel]()
     for mapped in previous:
         model = grower.remake(mapped.reconstruction)
-        hypotheses = _without_duplicates((*mapped.hypotheses, AGAIN))
-        found.append(replace(mapped, reconstruction=model, hypotheses=hypotheses))
+        found.append(_also_by(AGAIN, replace(mapped, reconstruction=model)))
     return with_own_images(found)
 
 
@@ -463,7 +472,7 @@ def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     if thin is graph:
         return []
     scorer = replace(search.scorer, graph=thin)
-    quick = replace(search, scorer=scorer, num_starts=0)
+    quick = replace(search, scorer=scorer, builds_bridges=False, tries_focals=False)
     models = quick.best(thin)
     if not models:
         return []
