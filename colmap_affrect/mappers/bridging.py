@@ -36,7 +36,7 @@ from colmap_affrect.project.report import Bridge
 
 # Judged on bridges of the benchmark scenes whose poses are known.
 # Of the longer side of an image: known depths so near are compared
-NEIGHBOR_RADIUS = 0.03
+DEPTH_RADIUS = 0.03
 # Known depths on a common plane may be so many times farther away; judged
 PLANE_RADIUS_FACTOR = 4.0
 MIN_AGREEING = 10  # depth ratios that agree with a scale; judged
@@ -176,7 +176,7 @@ class BridgeFinder:
         keypoints = self.graph.keypoints[image_id]
         positions = keypoints[relative.matches[:, side]].astype(np.float64)
         own = positions, relative.depths[side]
-        radius = NEIGHBOR_RADIUS * max(camera.width, camera.height)
+        radius = DEPTH_RADIUS * max(camera.width, camera.height)
         scale = scale_between(known, own, radius)
         if not _is_certain(scale):
             scale = scale_by_planes(known, own, PLANE_RADIUS_FACTOR * radius)

@@ -35,7 +35,7 @@ NUM_ITERATIONS = 100
 # More cameras than that are tried several at once, to save time; resource
 MAX_NUM_TRIALS = 12
 # Larger models have points of many images, which tell focal lengths; resource
-MAX_NUM_IMAGES = 100
+MAX_TRIAL_IMAGES = 100
 MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time; resource
 MAX_NUM_OBSERVATIONS = 3_000
 """The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
@@ -190,8 +190,8 @@ def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
 
 
 def _is_tried(model: pycolmap.Reconstruction) -> bool:
-    # A limit of models, other than sparse.LARGE, which is one of photographs
-    return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
+    # A limit of models, other than sparse.MIN_LARGE_SET, which is one of photographs
+    return model.num_reg_images() <= MAX_TRIAL_IMAGES and model.num_points3D() > 0
 
 
 def num_independent(model: pycolmap.Reconstruction) -> int:

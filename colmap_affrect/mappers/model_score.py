@@ -130,10 +130,20 @@ class ModelScorer:
         return num_matched_images(num_keypoints, pairs, viewpoint_of)
 
 
+def grid_cells(camera: pycolmap.Camera, points: Floats) -> Indices:
+    """Return the number of the cell of a grid over an image that holds each point, (N,).
+
+    Args:
+        camera: Of the image.
+        points: (N, 2) px; those outside of the image are of the nearest cell.
+    """
+    cells = (points / [camera.width, camera.height] * GRID).astype(np.int64)
+    return np.asarray(np.clip(cells, 0, GRID - 1) @ [1, GRID])
+
+
 def num_occupied_cells(camera: pycolmap.Camera, points: Floats) -> int:
     """Return how many cells of a grid over an image hold points, (N, 2) px."""
-    cells = (points / [camera.width, camera.height] * GRID).astype(int)
-    return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
+    return len(np.unique(grid_cells(camera, points)))
 
 
 def pair_log_ratio(num_agreeing: float, num: float) -> float:

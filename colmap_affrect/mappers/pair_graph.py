@@ -50,7 +50,7 @@ MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 # Inliers of a pair that are sampled for agreement and relative poses; resource
 MAX_MATCHES = 500
-MAX_TRIALS = 1000  # of RANSAC, for a relative pose; resource
+MAX_RANSAC_TRIALS = 1000  # of RANSAC, for a relative pose; resource
 # The strongest of each image that models are scored by (resource)
 MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
@@ -64,7 +64,7 @@ class VerifiedPair:
     ids: Ids
     matches: Indices  # (M, 2) features that are inliers
     geometry: pycolmap.TwoViewGeometry  # of the pair in the database
-    is_few: bool = False  # it has few matches, which are sure all the same
+    has_few_matches: bool = False  # it has few matches, which are sure all the same
 
 
 Pairs = tuple[VerifiedPair, ...]
@@ -127,7 +127,7 @@ class PairGraph:
             graph = cls.of(database, min_num_matches)
             enough = {pair.ids: pair.matches for pair in graph.verified}
             few = sure_few_matches(database, enough)
-            return graph._with_few(few, database) if few else graph
+            return graph._with_few_matches(few, database) if few else graph
 
     @classmethod
     def of(
@@ -155,7 +155,9 @@ class PairGraph:
         kept = [pair for pair in self.verified if pair.ids not in ids]
         return self._with(kept, self.cache)
 
-    def _with_few(self, few: Iterable[FewMatches], database: pycolmap.Database) -> Self:
+    def _with_few_matches(
+        self, few: Iterable[FewMatches], database: pycolmap.Database
+    ) -> Self:
         """Add pairs with few matches, whose keypoints a database has."""
         verified = [*self.verified]
         keypoints = {**self.keypoints}
@@ -169,9 +171,11 @@ class PairGraph:
         return replace(self, keypoints=keypoints)._with(verified, self.cache)
 
     @cached_property
-    def with_few_only(self) -> frozenset[int]:
+    def images_with_few_matches_only(self) -> frozenset[int]:
         """The images none of whose pairs has many matches."""
-        with_many = _images_of(pair for pair in self.verified if not pair.is_few)
+        with_many = _images_of(
+            pair for pair in self.verified if not pair.has_few_matches
+        )
         return frozenset(_images_of(self.verified) - with_many)
 
     @property
@@ -185,7 +189,7 @@ class PairGraph:
         return any(rig.num_sensors() > 1 for rig in self.cache.rigs.values())
 
     @cached_property
-    def most_connected(self) -> frozenset[int]:
+    def largest_component(self) -> frozenset[int]:
         """The images of the largest connected component."""
         components = connected_parts(pair.ids for pair in self.pairs)
         return frozenset(components[0] if components else ())
@@ -225,7 +229,7 @@ class PairGraph:
         """Return a graph of other pairs, with the cameras and images of a cache."""
         kept = list[VerifiedPair]()
         for pair in verified:
-            least = MIN_FEW if pair.is_few else self.min_num_matches
+            least = MIN_FEW if pair.has_few_matches else self.min_num_matches
             if len(pair.matches) >= least:
                 kept.append(pair)
         new = empty_copy(cache, {})
@@ -342,7 +346,7 @@ class PairGraph:
     ) -> list[Pose]:
         options = pycolmap.RANSACOptions(
             max_error=MAX_ERROR_PX,
-            max_num_trials=MAX_TRIALS,
+            max_num_trials=MAX_RANSAC_TRIALS,
             random_seed=max(random_seed, 0),
         )
         candidates = list[Pose]()

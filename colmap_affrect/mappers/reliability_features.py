@@ -77,9 +77,9 @@ class ReliabilityFeatures:
     """Longest by shortest focal length of the photographs of its size, of those that only the model
     tells: parts of photographs have longer ones, and their middle is elsewhere."""
     tie_point_log_odds: float  # of a right pose, by its tie points
-    bridge_edge: str
+    cut_pair: str
     """The pair without which it and others, at most half of all, would be apart, or empty."""
-    num_bridge_inliers: int  # of that pair
+    num_cut_pair_inliers: int  # of that pair
     direction_sigma_deg: float = 0.0
     """Deviation that the directions of translation to at least half of the others do not exceed."""
     axis_turn_deg: float = 0.0
@@ -165,7 +165,7 @@ def features_of(
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
-    bridges = _bridge_edges(context)
+    bridges = _cut_pairs(context)
     directions_deg = _direction_sigmas_deg(context, tie_points)
     names = context.graph.names
     found = {}
@@ -192,8 +192,8 @@ def features_of(
             else "",
             focal_spread=focal_spreads.get((camera.width, camera.height), 1.0),
             tie_point_log_odds=log_odds.get(image_id, 0.0),
-            bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
-            num_bridge_inliers=len(bridge.matches) if bridge else 0,
+            cut_pair=" - ".join(names[i] for i in bridge.ids) if bridge else "",
+            num_cut_pair_inliers=len(bridge.matches) if bridge else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
         )
@@ -316,7 +316,7 @@ def _focal_spreads(
     return {size: max(of_size) / min(of_size) for size, of_size in focals_px.items()}
 
 
-def _bridge_edges(context: _ModelContext) -> dict[int, VerifiedPair]:
+def _cut_pairs(context: _ModelContext) -> dict[int, VerifiedPair]:
     """Return the pair without which an image, with others, would be apart from half of all.
 
     Of several such pairs that with fewest inliers counts.

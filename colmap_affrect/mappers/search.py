@@ -53,7 +53,7 @@ class Search:
     adjuster: Adjuster
     scorer: ModelScorer
     native: pycolmap.IncrementalPipelineOptions
-    num_seeds: int  # first pairs in a row that may bring nothing
+    max_models_without_gain: int  # in a row, after which no others are grown
     show: Callable[[int], None]  # is told how many images a model has
     num_bridged_models: int = NUM_BRIDGED_MODELS  # from which bridges are built in turn
     builds_bridges: bool = True  # otherwise images that tracks do not register are left
@@ -155,7 +155,7 @@ class Search:
         joined = list[MappedModel]()
         for mapped in models[: self.num_bridged_models]:
             joined.append(register_bridges(mapped, bridges, grower, self.scorer))
-        return with_own_images([max(joined, key=self._score), *models])
+        return with_new_images([max(joined, key=self._score), *models])
 
     def is_certain(
         self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
@@ -171,7 +171,7 @@ class Search:
             Whether no pair contradicts it and its focal lengths agree, or tracks of three images
             confirm each image.
         """
-        if not graph.most_connected.issubset(model.reg_image_ids()):
+        if not graph.largest_component.issubset(model.reg_image_ids()):
             return False
         return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(
             model
@@ -220,7 +220,7 @@ class Search:
                 focal_px=prior.starts_px[min(number, len(prior.starts_px) - 1)],
                 sigma=sigma,
             )
-        return self._with_priors(priors)
+        return self._adjusting_with(priors)
 
     def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:
         """Return a search that keeps unknown focal lengths near those of a model."""
@@ -229,9 +229,10 @@ class Search:
             priors[key] = replace(
                 self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA
             )
-        return self._with_priors(priors)
+        return self._adjusting_with(priors)
 
-    def _with_priors(self, priors: Mapping[int, CameraPrior]) -> Self:
+    def _adjusting_with(self, priors: Mapping[int, CameraPrior]) -> Self:
+        """Return a search that adjusts with other priors of some cameras, and scores as before."""
         together = {**self.adjuster.priors, **priors}
         return replace(self, adjuster=replace(self.adjuster, priors=together))
 
@@ -271,7 +272,7 @@ class Search:
         models: dict[frozenset[int], MappedModel] = {}
         scores: dict[frozenset[int], float] = {}
         best_score = 0.0
-        num_in_vain = 0
+        num_without_gain = 0
         num_failed = 0
         pairs = first_pairs(first, graph)
         with closing(
@@ -285,15 +286,15 @@ class Search:
                     continue
                 num_failed = 0
                 score = self.scorer.score(model)
-                num_in_vain = (
-                    0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
+                num_without_gain = (
+                    0 if score > best_score + MIN_SCORE_GAIN else num_without_gain + 1
                 )
                 best_score = max(best_score, score)
                 images = frozenset(model.reg_image_ids())
                 if images not in models or score > scores[images]:
                     models[images] = MappedModel(model)
                     scores[images] = score
-                if num_in_vain >= self.num_seeds:
+                if num_without_gain >= self.max_models_without_gain:
                     break
                 is_complete = len(images) == len(graph.keypoints)
                 if is_complete and self.scorer.is_confirmed(model):
@@ -319,7 +320,7 @@ def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[Verifie
     return sorted(pairs, key=order)
 
 
-def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
+def with_new_images(models: Iterable[MappedModel]) -> list[MappedModel]:
     """Leave out models with less than two images that none before has."""
     found = list[MappedModel]()
     inside = set[int]()

@@ -18,10 +18,15 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.model_score import CHANCE, RIGHT_PAIR, beta_log_ratio
+from colmap_affrect.mappers.model_score import (
+    CHANCE,
+    GRID,
+    RIGHT_PAIR,
+    beta_log_ratio,
+    grid_cells,
+)
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
 
-GRID = 8  # cells on a side of a photograph; same as of scores (model_score)
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
 MAX_ANGLE_DEG = 40.0
 """Between the rays of two photographs to a point: beyond, matching loses much (judged)."""
@@ -29,7 +34,7 @@ MAX_ZOOM = 2.2  # ratio of scales, beyond which the same is true (judged)
 # Times the depth of a surface before a point, which is hidden then; judged
 HIDDEN = 1.15
 # Of the longer side: surfaces of a photograph are known so far from its points; judged
-NEIGHBOR_RADIUS = 0.06
+SURFACE_RADIUS = 0.06
 NUM_NEIGHBORS = 3  # whose median depth is that of the surface; theory
 MAX_NUM_POINTS = 500  # of a photograph that are looked at; resource
 MAX_NUM_PAIRS = 1000  # of a model: larger ones are not looked at; resource
@@ -113,7 +118,7 @@ class _Views:
         """
         places, ids, _ = self.seen(image_id)
         camera = self.model.cameras[self.model.images[image_id].camera_id]
-        cells = (places / [camera.width, camera.height] * GRID).astype(int) @ [1, GRID]
+        cells = grid_cells(camera, places)
         regions = []
         for side in (first, second):
             is_shared = np.zeros(len(ids), bool)
@@ -140,8 +145,8 @@ class _Views:
         open_rows = np.flatnonzero(is_expected & ~is_found)
         is_hidden = self._is_hidden(target, places[open_rows], local[open_rows, 2])
         is_expected[open_rows[is_hidden]] = False
-        cells = (places[is_expected] / [camera.width, camera.height] * GRID).astype(int)
-        return _counted(cells @ [1, GRID], is_found[is_expected])
+        cells = grid_cells(camera, places[is_expected])
+        return _counted(cells, is_found[is_expected])
 
     def _looks_alike(self, source: int, target: int, positions: Array) -> Bools:
         """Tell which positions two images see from similar directions and at similar scales."""
@@ -176,7 +181,7 @@ class _Views:
         pose = image.cam_from_world().matrix()
         own_depths = positions @ pose[2, :3] + pose[2, 3]
         camera = self.model.cameras[image.camera_id]
-        radius_px = NEIGHBOR_RADIUS * max(camera.width, camera.height)
+        radius_px = SURFACE_RADIUS * max(camera.width, camera.height)
         across = places[:, :1] - own[:, 0]
         down = places[:, 1:] - own[:, 1]
         distances = np.hypot(across, down)

@@ -17,7 +17,7 @@ from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import score_images
-from colmap_affrect.mappers.tie_points import NONE, TiePoints
+from colmap_affrect.mappers.tie_points import NO_TIE_POINTS, TiePoints
 from colmap_affrect.project.report import kept_probability
 
 NOISE_PX = 0.5
@@ -34,7 +34,7 @@ def placed(path: Path) -> pycolmap.Reconstruction:
 def complete(
     model: pycolmap.Reconstruction,
     path: Path,
-    tie_points: TiePoints = NONE,
+    tie_points: TiePoints = NO_TIE_POINTS,
     *,
     all_weak: bool = False,
 ) -> None:

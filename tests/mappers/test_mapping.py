@@ -293,14 +293,14 @@ def test_a_model_of_a_small_set_is_large_enough(
 
 
 @pytest.mark.parametrize(
-    ("probability", "noise_share", "num_images"),
+    ("probability", "precision_factor", "num_images"),
     [(0.2, 1.0, 3), (0.04, 1.0, 2), (0.04, 0.1, 3)],
 )
 def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     probability: float,
-    noise_share: float,
+    precision_factor: float,
     num_images: int,
 ) -> None:
     """What noise leaves open is no sign of a wrong pose."""
@@ -311,7 +311,7 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
         found = dict.fromkeys(names, Confidence(0.99, ()))
         if len(names) == 3:
             doubts = (Doubt("few_matches"),)
-            found[names[-1]] = Confidence(probability, doubts, 0.0, noise_share)
+            found[names[-1]] = Confidence(probability, doubts, 0.0, precision_factor)
         return found
 
     monkeypatch.setattr(mapping, "score_images", score)

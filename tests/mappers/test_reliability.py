@@ -137,8 +137,8 @@ GOOD = ReliabilityFeatures(
     mirrored_original="",
     focal_spread=1.0,
     tie_point_log_odds=0.0,
-    bridge_edge="",
-    num_bridge_inliers=0,
+    cut_pair="",
+    num_cut_pair_inliers=0,
 )
 
 
@@ -180,7 +180,7 @@ def test_a_bridge_edge_counts_by_its_inliers() -> None:
     probabilities = []
     for num_inliers in (15, 35, 55, 100):
         features = replace(
-            GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers
+            GOOD, cut_pair="a.jpg - b.jpg", num_cut_pair_inliers=num_inliers
         )
         probabilities.append(
             confidence(features).probability / confidence(GOOD).probability
@@ -224,11 +224,11 @@ def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
                 database.delete_two_view_geometry(one, two)
     names = [mapped.reconstruction.images[i].name for i in ids]
     found = features_of(mapped, task)
-    assert [bool(found[name].bridge_edge) for name in names] == [False] * 3 + [True] * 2
-    assert found[names[3]].bridge_edge == f"{names[1]} - {names[4]}"
-    assert found[names[3]].num_bridge_inliers == num
+    assert [bool(found[name].cut_pair) for name in names] == [False] * 3 + [True] * 2
+    assert found[names[3]].cut_pair == f"{names[1]} - {names[4]}"
+    assert found[names[3]].num_cut_pair_inliers == num
     alone, few = (
-        confidence(replace(found[names[3]], num_bridge_inliers=num))
+        confidence(replace(found[names[3]], num_cut_pair_inliers=num))
         for num in (200, 29)
     )
     assert few.probability < DOUBTFUL < alone.probability - 0.3

@@ -41,7 +41,7 @@ from colmap_affrect.mappers.model_score import (
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
 from colmap_affrect.mappers.search import Search, _Attempt
-from colmap_affrect.mappers.sparse import COLMAP_MODEL, OWN_CAMERAS
+from colmap_affrect.mappers.sparse import COLMAP_MODEL, PER_IMAGE_CAMERAS
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -512,7 +512,7 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
     large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     assert (large.hypotheses[-1], small.hypotheses) == (
-        OWN_CAMERAS,
+        PER_IMAGE_CAMERAS,
         ("with all pairs",),
     )
     found = focals_of(large)
