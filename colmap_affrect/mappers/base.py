@@ -97,21 +97,21 @@ class MappingTask:
         if not records or not options.keep_given_intrinsics:
             return RefinedIntrinsics(focal_lengths=True, distortion=True)
         focals = not all("focal" in record.given for record in records)
-        distortion = focals or not all(record.is_fixed for record in records)
+        distortion = focals or not all(record.is_all_given for record in records)
         return RefinedIntrinsics(focals, distortion)
 
     def constant_cameras(self, options: MapperOptions) -> set[int]:
         """Return the ids of the cameras that are not to be refined.
 
         One whose focal length alone is given is among them where others are refined: pycolmap has
-        no focal length that is fixed for some cameras only.
+        no focal length that is constant for some cameras only.
         """
         if not options.keep_given_intrinsics:
             return set()
         refines_focals = self.refined_intrinsics(options).focal_lengths
         found = set[int]()
         for key, record in self.cameras.items():
-            if record.is_fixed or (refines_focals and "focal" in record.given):
+            if record.is_all_given or (refines_focals and "focal" in record.given):
                 found.add(key)
         return found
 

@@ -28,7 +28,7 @@ def direction_sigmas_deg(
 ) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are.
 
-    Directions that tracks do not hold at all are passed over: the scale of bridges is known by
+    Directions that tracks do not determine are passed over: the scale of bridges is known by
     something else (:mod:`colmap_affrect.mappers.bridging`), of which the covariance knows nothing.
 
     Args:
@@ -65,7 +65,7 @@ def direction_sigmas_deg(
 def _determined(
     model: pycolmap.Reconstruction, covariance: pycolmap.BACovariance, noise_px: float
 ) -> dict[int, list[float]]:
-    """Return the deviations of the directions of each image that tracks hold, in degrees."""
+    """Return the deviations of the directions of each image that tracks determine, in degrees."""
     image_ids = sorted(model.reg_image_ids())
     found: dict[int, list[float]] = {image_id: [] for image_id in image_ids}
     for first, second in itertools.combinations(image_ids, 2):

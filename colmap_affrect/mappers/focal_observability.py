@@ -108,7 +108,7 @@ def focal_growths(
     unknown = [key for key in recorded if priors[key].is_unknown]
     if not unknown or not _is_tried(model):
         return {}
-    fixed = frozenset(key for key in recorded if task.cameras[key].is_fixed)
+    fixed = frozenset(key for key in recorded if task.cameras[key].is_all_given)
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     trials = _FocalTrials(with_fewer_points(model), priors, refining, fixed)
@@ -148,7 +148,7 @@ def fitting_focals(
     for key in given:
         free_priors[key] = replace(priors[key], sigma=FREE_SIGMA)
     # A wrong focal length is made up for by distortion, where that was free.
-    constant = frozenset(key for key in given if task.cameras[key].is_fixed)
+    constant = frozenset(key for key in given if task.cameras[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
     fixed = with_fewer_points(model)
     fixed_cost = Adjuster(

@@ -26,7 +26,8 @@ MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer; judged
 USUAL_ROTATION_RATIO = 0.5
 # Of focal lengths: farther apart they are no surer parts of others; judged
 MAX_LOG_SPREAD = 0.5
-# A bridge edge between two components may be of two scenes, found by chance among all pairs.
+# A pair that alone connects two components (a bridge of the graph) may be of two scenes, found
+# by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 # Inliers more that make the former less likely by a factor of e (judged)
 CHANCE_SCALE = 10.0
@@ -249,7 +250,7 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
-    """Return the odds that a bridge edge connects two scenes, 0 where there is none."""
+    """Return the odds that the cut pair of an image is of two scenes, 0 where it has none."""
     if not features.cut_pair:
         return 0.0
     return math.exp((CHANCE_INLIERS - features.num_cut_pair_inliers) / CHANCE_SCALE)

@@ -84,7 +84,7 @@ class ReliabilityFeatures:
     """Deviation that the directions of translation to at least half of the others do not exceed."""
     axis_turn_deg: float = 0.0
     """How far its rotations to others change with free principal points, where points contradict
-    those that are held and nothing tells where they are."""
+    those that are constant and nothing tells where they are."""
 
 
 class _ModelContext:
@@ -126,7 +126,7 @@ class _ModelContext:
         return viewpoint1 == viewpoint2
 
     def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
-        """Return the pairs of each frame with others: poses inside a rig hold each other."""
+        """Return the pairs of each frame with others: poses inside a rig determine each other."""
         found: dict[int, list[VerifiedPair]] = {
             self.frame_of(i): [] for i in self.pairs_of
         }
@@ -256,13 +256,14 @@ def _direction_sigmas_deg(
 ) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are, with its priors."""
     recorded = context.priors.keys() & context.task.cameras.keys()
-    fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
+    records = context.task.cameras
+    constant = frozenset(key for key in recorded if records[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions()
     adjuster = Adjuster(
         priors=context.priors,
         noise_px=NOISE_PX,
         refining=refining,
-        constant=fixed,
+        constant=constant,
         tie_points=tie_points,
     )
     return direction_sigmas_deg(context.model, adjuster)

@@ -56,10 +56,10 @@ class Search:
     max_models_without_gain: int  # in a row, after which no others are grown
     show: Callable[[int], None]  # is told how many images a model has
     num_bridged_models: int = NUM_BRIDGED_MODELS  # from which bridges are built in turn
-    builds_bridges: bool = True  # otherwise images that tracks do not register are left
-    tries_focals: bool = (
-        True  # otherwise models begin with the likeliest focal lengths only
-    )
+    # otherwise images that tracks do not register are left out
+    builds_bridges: bool = True
+    # otherwise models begin with the likeliest focal lengths alone
+    tries_focals: bool = True
 
     @property
     def graph(self) -> PairGraph:
@@ -88,10 +88,8 @@ class Search:
             model = attempt.models[0].reconstruction
             if attempt.score > best.score:
                 best = attempt
-                is_open = not attempt.agrees or self._lacks_bridges(
-                    search, graph, model
-                )
-                if search in initial and is_open:
+                lacks_bridges = self._lacks_bridges(search, graph, model)
+                if search in initial and (lacks_bridges or not attempt.agrees):
                     pending.insert(0, self._with_focals_of(model))
             if self.is_certain(model, graph, agrees=attempt.agrees):
                 break
@@ -269,15 +267,10 @@ class Search:
         self, graph: PairGraph, first: Sequence[VerifiedPair]
     ) -> list[MappedModel]:
         """Return models of different images from first pairs, the highest score first."""
-        models: dict[frozenset[int], MappedModel] = {}
-        scores: dict[frozenset[int], float] = {}
-        best_score = 0.0
-        num_without_gain = 0
+        best = _BestModels(self.scorer)
+        pairs = [pair.ids for pair in first_pairs(first, graph)]
         num_failed = 0
-        pairs = first_pairs(first, graph)
-        with closing(
-            _grow_in_order(self.grower(graph), [pair.ids for pair in pairs])
-        ) as grown:
+        with closing(_grow_in_order(self.grower(graph), pairs)) as grown:
             for model in grown:
                 if model is None:
                     num_failed += 1
@@ -285,24 +278,44 @@ class Search:
                         break
                     continue
                 num_failed = 0
-                score = self.scorer.score(model)
-                num_without_gain = (
-                    0 if score > best_score + MIN_SCORE_GAIN else num_without_gain + 1
-                )
-                best_score = max(best_score, score)
-                images = frozenset(model.reg_image_ids())
-                if images not in models or score > scores[images]:
-                    models[images] = MappedModel(model)
-                    scores[images] = score
-                if num_without_gain >= self.max_models_without_gain:
+                best.add(model)
+                if best.num_without_gain >= self.max_models_without_gain:
                     break
-                is_complete = len(images) == len(graph.keypoints)
+                is_complete = model.num_reg_images() == len(graph.keypoints)
                 if is_complete and self.scorer.is_confirmed(model):
                     break
-        return [
-            models[images]
-            for images in sorted(models, key=lambda images: -scores[images])
-        ]
+        return best.ranked()
+
+
+class _BestModels:
+    """The model with the highest score of each set of images that models have."""
+
+    def __init__(self, scorer: ModelScorer) -> None:
+        self.scorer = scorer
+        self.num_without_gain = (
+            0  # models in a row that scored no higher than all before
+        )
+        self._best_score = 0.0
+        self._models: dict[frozenset[int], pycolmap.Reconstruction] = {}
+        self._scores: dict[frozenset[int], float] = {}
+
+    def add(self, model: pycolmap.Reconstruction) -> None:
+        """Take a model, in the place of one of the same images that scores lower."""
+        score = self.scorer.score(model)
+        if score > self._best_score + MIN_SCORE_GAIN:
+            self.num_without_gain = 0
+        else:
+            self.num_without_gain += 1
+        self._best_score = max(self._best_score, score)
+        images = frozenset(model.reg_image_ids())
+        if images not in self._models or score > self._scores[images]:
+            self._models[images] = model
+            self._scores[images] = score
+
+    def ranked(self) -> list[MappedModel]:
+        """Return the models, the highest score first."""
+        ranked = sorted(self._models, key=lambda images: -self._scores[images])
+        return [MappedModel(self._models[images]) for images in ranked]
 
 
 def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:

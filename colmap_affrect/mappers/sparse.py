@@ -234,7 +234,9 @@ class SparseMapper(IncrementalMapper):
         """Return the ids of the cameras of which nothing is refined."""
         constant = set[int]()
         if self.options.keep_given_intrinsics:
-            constant |= {key for key, record in task.cameras.items() if record.is_fixed}
+            constant |= {
+                key for key, record in task.cameras.items() if record.is_all_given
+            }
         refines_others = (
             native.ba_refine_extra_params or native.ba_refine_principal_point
         )

@@ -176,7 +176,7 @@ def test_two_reasons_are_said_and_no_small_ones() -> None:
     ]
 
 
-def test_a_bridge_edge_counts_by_its_inliers() -> None:
+def test_a_cut_pair_counts_by_its_inliers() -> None:
     probabilities = []
     for num_inliers in (15, 35, 55, 100):
         features = replace(
@@ -211,7 +211,7 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     assert far_off.of_evidence == pytest.approx(confidence(GOOD).probability)
 
 
-def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
+def test_a_cut_pair_casts_doubt_on_the_smaller_of_two_components(
     tmp_path: Path,
 ) -> None:
     mapped, task = scene(tmp_path, 5)
