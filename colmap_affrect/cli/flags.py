@@ -266,6 +266,9 @@ FLAGS: dict[str, Settings] = {
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
         "pairs/a--b.png in the folder of the run)", dest="picture_path"),
+    "path@run": _path("PATH", "output folder of a run"),
+    "--port": {"metavar": "N", "type": count, "default": None, "help": "of 127.0.0.1; 0 takes one "
+        "that is free (default: 8427)"},
     "path@optional": _path("PATH", "output folder, any COLMAP database, or a model", nargs="?"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",
