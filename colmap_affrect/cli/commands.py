@@ -55,6 +55,7 @@ from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.line_pictures import report_lines
 from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.report.run_report import RunReport
+from colmap_affrect.report.two_runs import write_two_runs
 from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
@@ -373,6 +374,13 @@ def serve(options: argparse.Namespace) -> None:
         return pipeline.map_images(options.path, by_hand=said, progress=progress)
 
     page_server.serve(Workspace(options.path), by_hand, port, map_images, show)
+
+
+def show_runs(options: argparse.Namespace) -> None:
+    page = write_two_runs(
+        options.before, options.after, options.page_path, given.progress(options)
+    )
+    show(f"page        {page}")
 
 
 def show_pair(options: argparse.Namespace) -> None:

@@ -266,6 +266,10 @@ FLAGS: dict[str, Settings] = {
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
         "pairs/a--b.png in the folder of the run)", dest="picture_path"),
+    "before": _path("BEFORE", "output folder of a run, or a folder of models 0, 1, ..."),
+    "after": _path("AFTER", "output folder of another run of the same photographs"),
+    "--output-path@page": _path("FILE", "HTML file to make (default: compared.html in AFTER)",
+        dest="page_path"),
     "path@run": _path("PATH", "output folder of a run"),
     "--port": {"metavar": "N", "type": count, "default": None, "help": "of 127.0.0.1; 0 takes one "
         "that is free (default: 8427)"},

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,9 +13,10 @@ from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.errors import AffrectError, one_line
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.progress import Progress
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.drawn import Drawn
+from colmap_affrect.report.drawn import FOLDER, Drawn
 from colmap_affrect.report.photographs import quality_of
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.report.verdict import QUALITIES
@@ -108,6 +110,7 @@ class MapsAgain:
     def _map(self, drawn: Drawn) -> dict[str, Any]:
         """Map with what was drawn, and return what has changed."""
         before = read_summaries(self.workspace.sparse)
+        self._keep_models()
         by_hand = drawn.keep(self.workspace, self._by_hand)
         report = self._map_images(by_hand, Progress(self._said))
         residuals = []
@@ -120,6 +123,14 @@ class MapsAgain:
             "residuals": residuals,
             "why": report.why_no_model,
         }
+
+    def _keep_models(self) -> None:
+        """Keep the models that there are, for :mod:`colmap_affrect.report.two_runs`."""
+        kept = self.workspace.path / FOLDER / "before"
+        if kept.is_dir():
+            remove_own([kept])
+        if self.workspace.sparse.is_dir():
+            shutil.copytree(self.workspace.sparse, kept)
 
 
 def figures(
