@@ -238,7 +238,8 @@ FLAGS: dict[str, Settings] = {
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
-        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV) "
+        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV), report "
+        "(the page of the run, as PDF where a browser is there) "
         "(default: ply,text,cameras; no text where names have blanks)", type=words, default=()),
     "--camera-model@export": _value("MODEL", "COLMAP camera model of text and cameras, fitted to "
         "the cameras, e.g. RADIAL for OpenSfM (default: their own)", dest="camera_model"),
