@@ -1,6 +1,7 @@
 """Progress of long stages: a tqdm bar, lines or silence; and how long a whole run still takes."""
 
 import math
+import os
 import subprocess
 import sys
 import threading
@@ -21,7 +22,7 @@ COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 of 8 to 1000 photographs, good for a factor of 2."""
 AFTER_FIRST_MODEL = ("escalate", "learned", "pictures")
 """How the names of the stages begin that follow the first model."""
-AFTER_SHARE = 0.5
+AFTER_SHARE = 0.6
 """Of the time until the first model, what follows it: nothing where it is sure of all, up to twice
 as much; measured on sets of 4 to 7 photographs, good for a factor of 2."""
 GOES_ON_SHARE = 0.5
@@ -196,8 +197,14 @@ class _RunningStage:
 
     @property
     def done_cost(self) -> float:
-        """Of the units that are done."""
-        return self.cost * self._num_done / self.total if self.total else 0.0
+        """Of the units that are done, and of half of those that cores work on."""
+        num = self._num_done + self._num_begun
+        return self.cost * num / self.total if self._num_done else 0.0
+
+    @property
+    def _num_begun(self) -> float:
+        """Units that cores work on, each as half of one."""
+        return min(os.cpu_count() or 1, self.total - self._num_done) / 2
 
     def advance(self, num_done: int, now_s: float) -> None:
         """Take note of how many units are done."""
@@ -210,16 +217,16 @@ class _RunningStage:
         """Return how long the other units take; None while none is done.
 
         The first units wait for files and networks that are loaded, and do not count once there
-        are more.
+        are more. Before, what cores work on meanwhile counts as half done.
         """
         if not self._num_done:
             return None
+        num_left = self.total - self._num_done
         num_measured = self._num_done - self._num_first
-        seconds = now_s - self._first_s
-        if num_measured < MIN_NUM_MEASURED:
-            num_measured = self._num_done
-            seconds = now_s - self.began_s
-        return seconds / num_measured * (self.total - self._num_done)
+        if num_measured >= MIN_NUM_MEASURED:
+            return (now_s - self._first_s) / num_measured * num_left
+        pace = (now_s - self.began_s) / (self._num_done + self._num_begun)
+        return pace * (num_left - self._num_begun)
 
 
 def _duration(seconds: float) -> str:
