@@ -229,9 +229,20 @@ def _is_in_vain(
         with closing(matched_at_level(context, sample, options, 0)) as found:
             num_after = _sum_confirming(context.features, found)
         num_before = _sum_confirming(context.features, matches.read(sample))
-        known = (digest, num_after < MIN_GROWTH * num_before)
+        known = (digest, brings_nothing(num_before, num_after))
         matches.update_state(in_vain=known)
     return known == (digest, True)
+
+
+def brings_nothing(num_before: int, num_after: int) -> bool:
+    """Tell whether matching by all features is in vain, by confirmed matches of a sample.
+
+    >>> brings_nothing(100, 109), brings_nothing(100, 111), brings_nothing(100, 200)
+    (True, False, False)
+    >>> brings_nothing(0, 0), brings_nothing(0, 1)
+    (True, False)
+    """
+    return num_after == 0 or num_after < MIN_GROWTH * num_before
 
 
 def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:
