@@ -90,9 +90,14 @@ def plan_whole_image(
 ) -> RectificationPlan:
     """Warp an image as a whole by every tilt class.
 
+    A warp is stretched by the tilt along one direction of the photograph, against the direction
+    across: a class of angle 0 widens the photograph, one of pi / 2 makes it higher. The angle
+    turns from the right upwards, counterclockwise as one looks at the photograph.
+
     Args:
         image_size: (width, height) in px.
-        centers: (K, 2) rows (tilt, angle_rad).
+        centers: (K, 2) rows (tilt, angle_rad): by how much, and along which direction of the
+            photograph, from 0 up to pi.
         options: whether warps preserve areas.
 
     Returns:

@@ -189,7 +189,7 @@ class Guiding:
         return todo, num_done
 
     def _escalated(self, pairs: Sequence[Pair]) -> set[frozenset[str]]:
-        """Return the images of those pairs that were matched again, and have enough."""
+        """Return those pairs, as sets, that were matched again: they need no guided matching."""
         if not pairs:
             return set()
         asked = set(map(frozenset, pairs))

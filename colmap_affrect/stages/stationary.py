@@ -89,13 +89,15 @@ class _Votes:
     def background(self, places: Mask) -> Mask:
         """Return the cells, of places where nothing moves, that show what stands still."""
         is_most = self.still >= MIN_SHARE_OF_BACKGROUND * (self.still + self.moving)
-        return places & is_most & (self.still >= MIN_NUM_PAIRS)
+        has_enough = self.still >= MIN_NUM_PAIRS  # matches: as many as pairs elsewhere
+        return places & is_most & has_enough
 
 
 class StationaryFilter:
     """Drops the matches of pairs that lie where nothing moves.
 
-    Where that is the file of matches knows, as long as it exists.
+    Where that is, it reads from the file of matches when it is made; `learn` finds it and puts it
+    on record there.
     """
 
     def __init__(self, features: FeatureStore, matches: MatchStore) -> None:
