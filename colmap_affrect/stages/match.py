@@ -40,6 +40,7 @@ from colmap_affrect.pairs.lists import (
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import (
     PAIRS_PER_WRITE,
     FeatureStore,
@@ -62,7 +63,9 @@ MANY_MATCHES = 300
 NUM_TRIED = 40  # pairs matched by all features before many are; resource
 # Of the matches that confirm each other, by all features; small scans have none; judged
 MIN_GROWTH = 1.1
-NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others; judged
+# Pairs with many matches, beside which others of an image are matched by no more features: this
+# saves time; resource
+NUM_WELL_TIED = 3
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process; resource
 # Of a feature ready for matching, with descriptors of 128 and coarse ones; measured
 BYTES_PER_FEATURE = 870
@@ -97,9 +100,7 @@ def match(
         write_matches(context, database, pairs)
     wall_s = time.perf_counter() - start
     num_before = len(pairs) - missing.num
-    return StageReport(
-        "match", wall_s, missing.num, num_before, warnings=missing.warnings
-    )
+    return StageReport("match", wall_s, missing.num, num_before, warned=missing.warned)
 
 
 def _record_options(
@@ -122,7 +123,7 @@ class _Missing:
     """Pairs that were not matched before."""
 
     num: int
-    warnings: dict[str, str]
+    warned: tuple[StageWarning, ...]
 
 
 def _match_missing(
@@ -145,16 +146,15 @@ def _match_missing(
     with context.progress.stage("match, all features", len(wanted), "pairs") as advance:
         if not _is_in_vain(context, wanted, options, digest):
             match_pairs(context, wanted, options, advance)
-    warnings = dict[str, str]()
+    warned = list[StageWarning]()
     has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
-        line = StationaryFilter(context.features, matches).learn(pairs)
-        if line:
-            warnings["matches"] = line
-            logger.warning("matches: %s", line)
+        warned = StationaryFilter(context.features, matches).learn(pairs)
+        for warning in warned:
+            logger.warning("%s", warning.line())
     if finished != digest:
         matches.update_state(listed=digest)
-    return _Missing(len(missing), warnings)
+    return _Missing(len(missing), tuple(warned))
 
 
 def load_matchers(

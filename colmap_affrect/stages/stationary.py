@@ -25,6 +25,7 @@ from colmap_affrect.geometry.stationary import (
 from colmap_affrect.images.reading import grow_mask
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
@@ -57,12 +58,7 @@ MIN_SHARE_OF_BACKGROUND = 0.8
 """Matches that stand still, of all matches of one photograph in a cell that shows the background
 there, four in five: where something turns before it, they move (judged)."""
 
-WHAT = "a caption, a frame, a watermark, or the background of something that turns"
-CAMERA_STANDS_STILL = (
-    "nothing moves between most photographs, so that matches tell nothing of depth: the camera "
-    "stands still; take photographs from several places, or give masks of what stands still "
-    "(--mask-path) where something turns before it"
-)
+SUBJECT = "matches"  # of the warnings
 
 
 @dataclass(frozen=True)
@@ -168,20 +164,20 @@ class StationaryFilter:
                 found |= _at(background, cells)
         return found
 
-    def learn(self, pairs: Sequence[Pair]) -> str:
-        """Look for places in all matches, and drop those there; return a line, empty if none.
+    def learn(self, pairs: Sequence[Pair]) -> list[StageWarning]:
+        """Look for places in all matches, and drop those there; return a warning, or none.
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
         found = self._find(pairs)
-        idle = ""
+        idle = list[StageWarning]()
         for size, places in found.items():
             if not places.still.any():
                 continue
             if places.is_most and not self._moves_elsewhere(
                 pairs, size, places=places.still
             ):
-                idle = CAMERA_STANDS_STILL
+                idle = [StageWarning("camera_stands_still", SUBJECT)]
             else:
                 self._places[size] = places.still | self._places.get(size, places.still)
                 if places.is_most_exact:
@@ -200,10 +196,11 @@ class StationaryFilter:
                 num_matches += len(before.indices) - len(after.indices)
         if not num_pairs:
             return idle
-        return (
-            f"{num_matches} matches of {num_pairs} pairs never move ({WHAT}?) and were left out "
-            "(--set matching.filter_stationary_matches=false keeps them)"
-        )
+        values: dict[str, int | str] = {
+            "num_matches": num_matches,
+            "num_pairs": num_pairs,
+        }
+        return [StageWarning("stationary_matches", SUBJECT, values)]
 
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""
