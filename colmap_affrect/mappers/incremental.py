@@ -27,9 +27,10 @@ FLAG = "--mapper-options"
 class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0  # judged
+    # COLMAP's 16 and 100, halved, as its pipeline does where no first pair is found
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     """Smallest angle between the rays of a point, in the first pair of images."""
-    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50  # judged
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50  # COLMAP
     """Fewest inliers of the first pair of images."""
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12  # judged
     """Fewest points that an image is registered by."""

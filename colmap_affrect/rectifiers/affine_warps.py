@@ -24,7 +24,8 @@ from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
-# Parts of a region that are closer than this are warped together; judged
+# Parts of a region that are closer than this share a canvas: the margins of two would show the
+# same pixels twice; resource
 GAP_BLOCKS = 5
 
 
