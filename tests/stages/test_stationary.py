@@ -75,6 +75,18 @@ def test_caption_is_left_out_and_what_moves_stays(tmp_path: Path) -> None:
     assert StationaryFilter(features, matches).learn(pairs) == []
 
 
+def test_captions_of_large_photographs_stand_still_though_they_are_some_pixels_off(
+    tmp_path: Path,
+) -> None:
+    """Features were found in photographs that had been shrunk."""
+    large = (4 * SIZE[0], 4 * SIZE[1])
+    points = [4.0 * scan for scan in scans(4)]
+    features, matches, pairs = stores(tmp_path, points, [large] * 4)
+    assert StationaryFilter(features, matches).learn(pairs) == [
+        left_out(6 * len(CAPTION), 6)
+    ]
+
+
 def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(
     tmp_path: Path,
 ) -> None:
