@@ -35,6 +35,7 @@ from colmap_affrect.progress import Forecast, GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.report.run_results import MappingResult, write_results
@@ -520,10 +521,8 @@ def map_and_report(
     marks = _check_by_hand(context.by_hand, names, mapper, size_of=sizes.get)
     before = existing_names(extend.model_path, names) if extend else []
     report, models = map_pairs(context, mapper, extend, overwrite=overwrite)
-    lost = dict.fromkeys(
-        gone, "is gone since its features were extracted; these are used"
-    )
-    report = replace(report, warnings={**report.warnings, **lost})
+    lost = [StageWarning("photograph_gone", name) for name in gone]
+    report = replace(report, warned=(*report.warned, *lost))
     result = MappingResult(
         options=mapper.options,
         names=names,

@@ -17,6 +17,7 @@ from colmap_affrect.project.report import (
     ModelSummary,
     StageReport,
 )
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pair_lines import lines_of_pairs
 from colmap_affrect.report.pair_matches import PairReader
@@ -71,7 +72,16 @@ def small_report(folder: Path) -> RunReport:
         stages=(
             StageReport("extract", 6.5, 5, failures={NAMES[5]: failure}),
             StageReport(
-                "map", 3.25, 1, warnings={"/home/someone/model": "an <old> one"}
+                "map",
+                3.25,
+                1,
+                warned=(
+                    StageWarning(
+                        "not_rectified",
+                        "/home/someone/model",
+                        {"reason": "an <old> one"},
+                    ),
+                ),
             ),
         ),
         recipe="default",

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from pathlib import Path
 
 import pytest
-from deciding_numbers import JUDGED, MAX_JUDGED, PACKAGE, Module, Number, all_numbers
+from deciding_numbers import (
+    JUDGED,
+    MAX_JUDGED,
+    PACKAGE,
+    ROOT,
+    Module,
+    Number,
+    all_numbers,
+)
+from mutations import multiplied, mutations
 
 EXAMPLE = '''
 from typing import Annotated
@@ -70,3 +80,36 @@ def test_files_of_fitted_numbers_say_when_and_from_what_they_were_made() -> None
         content = json.loads(path.read_text(encoding="utf-8"))
         assert "tests/benchmarks/" in content["made"], path
         assert content["data"], path
+
+
+@pytest.mark.parametrize(
+    ("value", "larger", "smaller"),
+    [
+        ("0.5", "0.5 * 10.0", "0.5 * 0.1"),
+        ("12", "120", "1"),
+        ("(0.5, -3)", "(0.5 * 10.0, -3 * 10.0)", "(0.5 * 0.1, -3 * 0.1)"),
+        ("{'a': Pair(x=2)}", "{'a': Pair(x=20)}", "{'a': Pair(x=1)}"),
+        ("np.cos(1.5)", "np.cos(1.5) * 10.0", "np.cos(1.5) * 0.1"),
+    ],
+)
+def test_numbers_become_ten_times_larger_and_smaller(
+    value: str, larger: str, smaller: str
+) -> None:
+    for factor, expected in ((10.0, larger), (0.1, smaller)):
+        found = multiplied(ast.parse(value, mode="eval").body, factor)
+        assert ast.unparse(found) == expected
+
+
+def test_a_mutation_changes_one_statement_of_a_module_alone() -> None:
+    tried = list(mutations(["geometry"]))
+    assert len(tried) > 20
+    for mutation in tried:
+        before = (ROOT / mutation.module).read_text(encoding="utf-8")
+        first = ast.parse(before).body
+        second = ast.parse(mutation.text()).body
+        differing = [
+            one
+            for one, other in zip(first, second, strict=True)
+            if ast.dump(one) != ast.dump(other)
+        ]
+        assert len(differing) == 1, mutation.name

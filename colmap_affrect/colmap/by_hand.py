@@ -26,6 +26,8 @@ from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.tables import read_table
 
 SIGMA_PX = 3.0  # standard deviation of a mark by hand; judged
+# Of the error of a mark that fits: one of 3,000 has more by chance; theory
+AGREEING_SIGMAS = 4.0
 COLUMNS = {
     "point": ("point", "marker", "label"),
     "photograph": ("photograph", "photo", "image", "camera"),

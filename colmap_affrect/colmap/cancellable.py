@@ -6,6 +6,7 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import AffrectError
 from colmap_affrect.parallel.executor import return_freed_memory
 
 Result = TypeVar("Result")
@@ -43,3 +44,41 @@ def run_cancellable(
         ended.wait(LEAVE_AFTER_S)
         raise
     return outcome.result()
+
+
+def run_mapping(
+    call: Callable[[pycolmap.CancellationToken], Result],
+    token: pycolmap.CancellationToken | None,
+    what: str,
+) -> Result:
+    """Run one of COLMAP's mappers, and end as mappers do that are stopped or fail.
+
+    Args:
+        call: of pycolmap; a call that cannot be stopped may leave the token unused.
+        token: of the task.
+        what: is mapped by, for the message: ``incremental mapper``.
+
+    Returns:
+        What the call returns.
+
+    Raises:
+        AffrectError: COLMAP ends with an error.
+        KeyboardInterrupt: the token was cancelled, before or meanwhile.
+    """
+    _raise_if_cancelled(token)
+    try:
+        found = run_cancellable(call, token)
+    except InterruptedError as error:
+        raise KeyboardInterrupt from error
+    except AffrectError:
+        raise
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise AffrectError(f"COLMAP's {what} failed: {reason}") from error
+    _raise_if_cancelled(token)
+    return found
+
+
+def _raise_if_cancelled(token: pycolmap.CancellationToken | None) -> None:
+    if token and token.is_cancelled:
+        raise KeyboardInterrupt

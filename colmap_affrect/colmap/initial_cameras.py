@@ -35,6 +35,7 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.photographs import CameraOptions, photograph_files
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
+from colmap_affrect.project.stage_warnings import StageWarning
 
 # Longer by shorter side of a photograph that no panorama is; theory: the longest film is 617 (2.8)
 MAX_ASPECT = 4.0
@@ -113,11 +114,11 @@ class InitialCameras:
             found[self.group(name)].append(name)
         return dict(found)
 
-    def check(self, names: Sequence[str]) -> str:
+    def check(self, names: Sequence[str]) -> list[StageWarning]:
         """Refuse images that cannot have the cameras that they should.
 
-        OptionError names the option, or file and line, and what to do. Returns a line where images
-        are to share a camera that cannot, for their sizes; else an empty one.
+        OptionError names the option, or file and line, and what to do. Returns a warning where
+        images are to share a camera that cannot, for their sizes.
         """
         unknown = list[str]()
         for name in self._given:
@@ -139,8 +140,8 @@ class InitialCameras:
                 "photographs of that size, or leave the model out"
             )
 
-    def _several_sizes(self, names: Sequence[str]) -> str:
-        """Say which images have several sizes that are to share a camera, the first ones found.
+    def _several_sizes(self, names: Sequence[str]) -> list[StageWarning]:
+        """Warn of images of several sizes that are to share a camera, of the first ones found.
 
         OptionError where all parameters are given: these are of one size.
         """
@@ -161,10 +162,10 @@ class InitialCameras:
             self._refuse_params_of_one_size(first, name, both)
             note = note or both
         if not note:
-            return ""
+            return []
         most = max(map(len, sizes.values()))
-        have = f"images that should share a camera have {most} sizes, and those of each share one"
-        return f"{note}; {have}"
+        values: dict[str, int | str] = {"example": note, "num_sizes": most}
+        return [StageWarning("several_sizes", "cameras", values)]
 
     def _refuse_params_of_one_size(self, first: str, second: str, both: str) -> None:
         """Refuse the same given parameters for images of two sizes, which ``both`` tells."""

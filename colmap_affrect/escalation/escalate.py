@@ -36,6 +36,7 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.match_state import Begun, Worth
 from colmap_affrect.project.report import MatchedAgain, StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import Learned, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
@@ -233,30 +234,32 @@ class Escalation:
 
     def final_report(self, report: StageReport) -> StageReport:
         """Return the report with what could not be tried, which is logged, too."""
-        warnings = self._missing_weights()
+        warned = self._missing_weights()
         if self.is_over_time:
-            warnings["time"] = (
-                "it is over; the same command without --max-time tries more"
-            )
-        for what, text in warnings.items():
-            logger.warning("%s: %s", what, text)
+            warned.append(StageWarning("time_over", "time"))
+        for warning in warned:
+            logger.warning("%s", warning.line())
         return StageReport(
             name="escalate",
             wall_s=report.wall_s,
             num_done=report.num_done,
-            warnings=warnings,
+            warned=tuple(warned),
         )
 
-    def _missing_weights(self) -> dict[str, str]:
-        """Say for which images levels that lack weights would be tried."""
+    def _missing_weights(self) -> list[StageWarning]:
+        """Warn of images for which levels that lack weights would be tried."""
         how = self.context.resources.how_to_complete(self.context.extraction)
         if not how:
-            return {}
+            return []
         left = sorted(self.state.weights(self.state.models()))
         if not left:
-            return {}
-        text = f"its weights are not here; it may tie {such_as(left)}: {how}; then run this again"
-        return {"learned matching": text}
+            return []
+        values: dict[str, int | str] = {
+            "num": len(left),
+            "examples": such_as(left),
+            "how": how,
+        }
+        return [StageWarning("no_weights", "learned matching", values)]
 
     def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.

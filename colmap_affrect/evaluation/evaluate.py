@@ -270,8 +270,8 @@ class RecipeRun:
                 logger.warning("%s", error)
                 self.failures[name] = str(error)
                 return False
-            if found.warning:
-                logger.warning("%s: %s", name, found.warning)
+            if found.not_rectified:
+                logger.warning("%s: not rectified: %s", name, found.not_rectified)
             if missing:
                 store.extend(name, found.features, missing)
             else:

@@ -40,7 +40,8 @@ MIN_FUNDAMENTAL_MATCHES = 8  # determine a fundamental matrix linearly; theory
 # Five determine several essential matrices, without support for any of them; theory
 MIN_POSE_MATCHES = 6
 MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices; judged
-# Largest transfer error or Sampson distance of a correct match; judged
+# Largest transfer error or Sampson distance of a correct match; same as
+# VerificationOptions.max_error_px
 CORRECT_PX = 3.0
 # In x and y, of the pixels over which the error of a homography is a mean; resource
 GRID_STEP_PX = 4

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
+from colmap_affrect.geometry.neighbors import MAX_RELATIVE_ERROR
 
 MAX_SHEET_ROTATION = 0.01
 """Rotation in radians, and change of scale, between two positions of a sheet on a scanner; theory:
@@ -21,8 +22,6 @@ EXACT_RATIO = 0.9
 keypoints are badly localized."""
 # Motions that are compared with each other, which bounds time; resource
 MAX_COMPARED = 300
-MAX_SLOPE = 0.5
-"""Difference of the motions of two points of one object, as a share of their distance; judged."""
 # Of a rotation to the motions that agree, each of which may make more agree; resource
 MAX_FITS = 3
 
@@ -78,6 +77,9 @@ def means_of_regions(
 def num_moving_together(points: Floats, motions: Floats, radius_px: float) -> int:
     """Count the matches that have a neighbour with a similar motion, as matches of one object.
 
+    Motions differ by at most ``MAX_RELATIVE_ERROR`` of the distance, as of matches that support
+    each other.
+
     Args:
         points: (N, 2) px of matches in the first photograph; of many some are looked at.
         motions: (N, 2) px to the second photograph.
@@ -92,7 +94,7 @@ def num_moving_together(points: Floats, motions: Floats, radius_px: float) -> in
     distances = np.linalg.norm(sampled_points[:, None] - sampled_points, axis=2)
     differences = np.linalg.norm(sampled_motions[:, None] - sampled_motions, axis=2)
     is_near = (distances <= radius_px) & (distances > 0.0)
-    is_similar = differences <= MAX_SLOPE * distances
+    is_similar = differences <= MAX_RELATIVE_ERROR * distances
     has_companion = (is_near & is_similar).any(axis=1)
     return int(step * np.count_nonzero(has_companion))
 

@@ -23,8 +23,8 @@ half of ``MAX_LOG_DIFFERENCE``."""
 # Added to normal equations, which twelve points on a line leave singular; numeric
 PLANE_DAMPING = 1e-9
 NUM_INDEPENDENT = 10
-"""Ratios that make the scale more certain, at most: all share the errors of the same poses;
-judged."""
+"""Ratios that make the scale more certain, at most: all share the errors of the same poses; so
+many, too, must agree with the scale of a bridge (judged)."""
 
 
 @dataclass(frozen=True)

@@ -27,20 +27,23 @@ from colmap_affrect.options import Options, within
 from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.regular_files import read_regular_text
+from colmap_affrect.project.stage_warnings import (
+    ODD_NAMES,
+    OddName,
+    StageWarning,
+    WarningCode,
+    texts_by_subject,
+)
 from colmap_affrect.project.stores import pair_key
 
 TIFF_SUFFIXES = (".tif", ".tiff")
-THUMBNAILS = "thumbnails that a NAS or another system keeps, not photographs"
-DELETED = "what was deleted, or was there before"
-FOLDERS_OF_SYSTEMS = {
-    "@eaDir": THUMBNAILS, "@__thumb": THUMBNAILS, "__MACOSX": THUMBNAILS,
-    "#recycle": DELETED, "@Recycle": DELETED, "$RECYCLE.BIN": DELETED,
-    "#snapshot": DELETED, "@Recently-Snapshot": DELETED,
+FOLDERS_OF_SYSTEMS: dict[str, WarningCode] = {
+    "@eaDir": "thumbnails", "@__thumb": "thumbnails", "__MACOSX": "thumbnails",
+    "#recycle": "deleted_folder", "@Recycle": "deleted_folder",
+    "$RECYCLE.BIN": "deleted_folder", "#snapshot": "deleted_folder",
+    "@Recently-Snapshot": "deleted_folder",
 }  # fmt: skip
 """What folders hold that are beside photographs, but nobody has put there, by their names."""
-LINKED_TWICE = (
-    "a link to a folder that is looked through anyway, or holds that of the photographs"
-)
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 
 
@@ -220,8 +223,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     files = photograph_files(image_path, IMAGE_SUFFIXES)
     names = [name for name in files if not _odd(name)]
     if not names:
-        reasons = left_out(image_path).items()
-        others = "".join(f"; {kind}: {why}" for kind, why in reasons)
+        others = "".join(f"; {warning.line()}" for warning in left_out(image_path))
         raise OptionError(
             f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}"
         )
@@ -238,45 +240,47 @@ def require_folder(image_path: Path) -> None:
         )
 
 
-def left_out(image_path: Path) -> dict[str, str]:
+def left_out(image_path: Path) -> list[StageWarning]:
     """Return why photographs in a folder are passed over: for their format, names, or as pages."""
-    found: dict[str, list[str]] = {}
-    files, reasons = _walk(
-        image_path, (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)
-    )
+    suffixes = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES, *VIDEOS)
+    files, found = _walk(image_path, suffixes)
+    names_of_kinds: dict[tuple[WarningCode, str], list[str]] = {}
     for name in sorted(files):
-        suffix = _suffix(name)
-        if suffix not in IMAGE_SUFFIXES:
-            found.setdefault(f"*{suffix}", []).append(name)
-        elif _odd(name):
-            found.setdefault("names", []).append(name)
-        is_tiff = suffix in TIFF_SUFFIXES
+        kind = _kind_left_out(name)
+        if kind:
+            names_of_kinds.setdefault(kind, []).append(name)
+        is_tiff = _suffix(name) in TIFF_SUFFIXES
         num_pages = len(reading.pages(image_path / name)) if is_tiff else 1
         if num_pages > 1:
-            reasons[name] = (
-                f"has {num_pages} pages, and only the first is used; colmap-affrect convert makes "
-                "a file of each"
-            )
-    for kind, names in found.items():
-        why = (
-            "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
-        )
-        if kind[1:] in VIDEOS:
-            why = "it is a video; take photographs out of it, as: ffmpeg -i it -vf fps=2 %04d.jpg"
-        elif kind == "names":
-            why = f"{_odd(names[0])}; rename it"
-        reasons[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
-    return reasons
+            found.append(StageWarning("pages", name, {"num_pages": num_pages}))
+    for (code, about), names in names_of_kinds.items():
+        values: dict[str, int | str] = {
+            "num": len(names),
+            "example": one_line(names[0]),
+        }
+        found.append(StageWarning(code, about, values))
+    return found
 
 
-def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
+def _kind_left_out(name: str) -> tuple[WarningCode, str] | None:
+    """Return why a file is passed over, and what the warning begins with; None if it is not."""
+    suffix = _suffix(name)
+    if suffix in VIDEOS:
+        return "video", f"*{suffix}"
+    if suffix not in IMAGE_SUFFIXES:
+        return "format_unread", f"*{suffix}"
+    odd = _odd(name)
+    return (odd, "names") if odd else None
+
+
+def not_named(image_path: Path, names: Collection[str]) -> list[StageWarning]:
     """Return a warning of the photographs in a folder that a database does not name, if any."""
     files = photograph_files(image_path, IMAGE_SUFFIXES)
     found = [name for name in files if name not in names]
     if not found:
-        return {}
-    why = f"{len(found)} photographs are left out, such as {one_line(found[0])}"
-    return {str(image_path): f"{why}: the database does not name them"}
+        return []
+    values: dict[str, int | str] = {"num": len(found), "example": one_line(found[0])}
+    return [StageWarning("not_in_database", str(image_path), values)]
 
 
 def photograph_files(
@@ -291,17 +295,21 @@ def photograph_files(
 
 def folders_left_out(folder: Path) -> dict[str, str]:
     """Return why folders below that of the photographs are passed over, by what is said of them."""
-    return _walk(folder, ())[1]
+    return texts_by_subject(_walk(folder, ())[1])
 
 
-def _walk(folder: Path, suffixes: Collection[str]) -> tuple[list[str], dict[str, str]]:
+def _walk(
+    folder: Path, suffixes: Collection[str]
+) -> tuple[list[str], list[StageWarning]]:
     """Return the names of the files below a folder that end so, and why folders are left out."""
     walk = _Walk(folder, suffixes)
     while walk.ahead or walk.linked:
         walk.enter(walk.ahead.popleft() if walk.ahead else walk.linked.popleft())
-    left_out = walk.left_out.items()
-    reasons = {such_as(map(one_line, names)): f"left out: {w}" for w, names in left_out}
-    return walk.found, reasons
+    warnings = list[StageWarning]()
+    for (code, reason), names in walk.left_out.items():
+        values: dict[str, int | str] = {"reason": reason} if reason else {}
+        warnings.append(StageWarning(code, such_as(map(one_line, names)), values))
+    return walk.found, warnings
 
 
 class _Walk:
@@ -314,7 +322,10 @@ class _Walk:
         self.folder = folder
         self.suffixes = suffixes
         self.found: list[str] = []
-        self.left_out: defaultdict[str, list[str]] = defaultdict(list)
+        # Names of folders, by the code of the warning and the reason that the system gives
+        self.left_out: defaultdict[tuple[WarningCode, str], list[str]] = defaultdict(
+            list
+        )
         self.ahead = deque([folder])
         self.linked = deque[Path]()
         self.seen = {_identity(path) for path in resolved(folder).parents}
@@ -328,16 +339,14 @@ class _Walk:
             identity = _identity(path)
             entries = sorted(os.scandir(path), key=lambda entry: entry.name)
         except OSError as error:
-            self.left_out[f"cannot be read ({error.strerror}); permit reading"].append(
-                below
-            )
+            self.left_out["folder_unreadable", error.strerror or ""].append(below)
             return
         if identity not in self.seen:
             self.seen.add(identity)
             for entry in entries:
                 self._meet(entry, below)
         elif path.is_symlink():
-            self.left_out[LINKED_TWICE].append(below)
+            self.left_out["folder_linked_twice", ""].append(below)
 
     def _meet(self, entry: os.DirEntry[str], below: str) -> None:
         """Take a file, or put a folder among those to look through."""
@@ -348,7 +357,7 @@ class _Walk:
             if _suffix(name) in self.suffixes:
                 self.found.append(below + name)
         elif name in FOLDERS_OF_SYSTEMS:
-            self.left_out[FOLDERS_OF_SYSTEMS[name]].append(f"{below}{name}/")
+            self.left_out[FOLDERS_OF_SYSTEMS[name], ""].append(f"{below}{name}/")
         elif not is_output_folder(self.folder / below / name):
             among = self.linked if entry.is_symlink() else self.ahead
             among.append(self.folder / below / name)
@@ -371,18 +380,15 @@ def _suffix(name: str) -> str:
     return posixpath.splitext(name)[1].lower()
 
 
-def _odd(name: str) -> str:
-    """Say why lists of images, one a line, cannot hold a name; empty if they can."""
+def _odd(name: str) -> OddName | None:
+    """Return why lists of images, one a line, cannot hold a name; None if they can."""
     if name.isascii() and name.isprintable():
-        return ""
+        return None
     if name != name.encode("utf-8", "replace").decode("utf-8"):
-        return "the name is not UTF-8"
+        return "name_not_utf_8"
     if any(unicodedata.category(character) in ("Cc", "Zl", "Zp") for character in name):
-        return (
-            "the name has a line break, tab or other control character, which lists of images "
-            "cannot hold"
-        )
-    return ""
+        return "control_character"
+    return None
 
 
 def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
@@ -423,9 +429,9 @@ def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> li
     found = sorted({PurePosixPath(as_path(name)).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
-        why = _odd(name)
-        if why:
-            raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
+        odd = _odd(name)
+        if odd:
+            raise ImageError(f"{image_path}: {name!r}: {ODD_NAMES[odd]}")
     if missing:
         raise OptionError(
             f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}"

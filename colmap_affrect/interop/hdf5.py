@@ -85,7 +85,7 @@ from colmap_affrect.project.stores import (
 )
 from colmap_affrect.stages.descriptors import (
     Arrays,
-    iterate_matches,
+    iterate_descriptor_matches,
     unit_rows,
     write_given_matches,
 )
@@ -289,7 +289,7 @@ def _matches(
 
     def matched_pairs(_: Mapping[str, int]) -> Iterator[tuple[Pair, Indices]]:
         try:
-            for pair, matches in iterate_matches(pairs, read):
+            for pair, matches in iterate_descriptor_matches(pairs, read):
                 yield pair, matches.indices
         except OptionError as error:
             raise StoreError(f"{features.path}: {error}") from error

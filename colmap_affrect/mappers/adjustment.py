@@ -16,7 +16,7 @@ import pyceres
 from pycolmap.cost_functions import ReprojErrorCost
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.by_hand import SIGMA_PX
+from colmap_affrect.colmap.by_hand import AGREEING_SIGMAS, SIGMA_PX
 from colmap_affrect.colmap.model_files import all_see_long_tracks
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.camera_priors import (
@@ -38,8 +38,6 @@ TOLERANCE = 1e-7  # the same of all others; numeric
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one (measured)
 MIN_LONG_TRACKS = 100
 """Tracks of three images that every image needs before tracks of two are left out (judged)."""
-# In deviations of keypoints: tie points pull from farther away; judged
-TIE_POINT_LOSS_SCALE = 4.0
 
 # When a trial adjustment ends early. Measured: this changes the growth of the cost by less than
 # three times as many iterations do, four per cent.
@@ -316,7 +314,7 @@ class Adjuster:
         """Add tie points once more, with the weight of their own noise.
 
         COLMAP has added them as points like all others, whose robust loss hardly pulls where a
-        mark is far from its reprojection.
+        mark is far from its reprojection. Here it does up to the error of marks that fit.
         """
         covariance = np.eye(2) * (SIGMA_PX / self.noise_px) ** 2
         for _, image_id, mark in self.tie_points.observed(model):
@@ -335,7 +333,7 @@ class Adjuster:
             ]
             if all(map(problem.has_parameter_block, blocks)):
                 cost = ReprojErrorCost(camera.model, covariance, mark.xy)
-                loss = pyceres.CauchyLoss(TIE_POINT_LOSS_SCALE * self.noise_px)
+                loss = pyceres.CauchyLoss(AGREEING_SIGMAS * self.noise_px)
                 problem.add_residual_block(cost, loss, blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:

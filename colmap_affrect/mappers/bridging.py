@@ -18,6 +18,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.two_views import (
+    NUM_INDEPENDENT,
     ScaleEstimate,
     scale_between,
     scale_by_planes,
@@ -39,7 +40,6 @@ from colmap_affrect.project.report import Bridge
 DEPTH_RADIUS = 0.03
 # Known depths on a common plane may be so many times farther away; judged
 PLANE_RADIUS_FACTOR = 4.0
-MIN_AGREEING = 10  # depth ratios that agree with a scale; judged
 MIN_AGREEING_SHARE = 0.5  # of all ratios: right pairs have 0.8, chance 0.25; measured
 # Of the logarithm: relative poses are estimated once for such a step; resource
 FOCAL_STEP = 0.02
@@ -213,7 +213,7 @@ class BridgeFinder:
 def _is_certain(scale: ScaleEstimate | None) -> bool:
     if scale is None:
         return False
-    return scale.num_agreeing >= MIN_AGREEING and scale.share >= MIN_AGREEING_SHARE
+    return scale.num_agreeing >= NUM_INDEPENDENT and scale.share >= MIN_AGREEING_SHARE
 
 
 def _chained(known: Pose, relative: Pose, side: int, scale: float) -> Pose:

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.cancellable import run_mapping
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.native_options import Plain, resolve, set_values
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.camera_priors import camera_priors
@@ -80,6 +80,7 @@ class GlobalMapper:
         Raises:
             OptionError: When a model is to be extended.
             AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped, once COLMAP has ended.
         """
         if task.extend:
             raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
@@ -91,11 +92,7 @@ class GlobalMapper:
             )
             return list(found.values())
 
-        try:
-            models = run_cancellable(call, task.cancellation)
-        except (RuntimeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise AffrectError(f"COLMAP's global mapper failed: {reason}") from error
+        models = run_mapping(call, task.cancellation, "global mapper")
         for model in models:
             self._restore_given_cameras(model, task, native.mapper.bundle_adjustment)
         show(max((model.num_reg_images() for model in models), default=0))

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.cancellable import run_mapping
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import model_poses, registered_names
 from colmap_affrect.colmap.native_options import resolve, set_values
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
 from colmap_affrect.mappers.snapshots import (
@@ -27,9 +27,10 @@ FLAG = "--mapper-options"
 class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0  # judged
+    # COLMAP's 16 and 100, halved, as its pipeline does where no first pair is found
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     """Smallest angle between the rays of a point, in the first pair of images."""
-    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50  # judged
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50  # COLMAP
     """Fewest inliers of the first pair of images."""
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12  # judged
     """Fewest points that an image is registered by."""
@@ -100,15 +101,7 @@ class IncrementalMapper:
             show=show,
             database_path=task.database_path,
         )
-        try:
-            models = run_cancellable(run.models, task.cancellation)
-        except InterruptedError as error:
-            raise KeyboardInterrupt from error
-        except (RuntimeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise AffrectError(
-                f"COLMAP's incremental mapper failed: {reason}"
-            ) from error
+        models = run_mapping(run.models, task.cancellation, "incremental mapper")
         return [MappedModel(model) for model in models]
 
     def native(

@@ -58,7 +58,8 @@ class SparseOptions(PipelineOptions):
 
     name: Literal["sparse"] = "sparse"
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40  # judged
-    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0  # judged
+    # COLMAP's 16, halved twice, as its pipeline does where no first pair is found
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0
     noise_px: Annotated[float, within(0.01, 100.0)] = NOISE_PX
     """Standard deviation of keypoints; larger errors count less and less."""
     num_seeds: Annotated[int, within(1, 1000)] = 6  # resource

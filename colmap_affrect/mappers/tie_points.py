@@ -13,14 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.by_hand import SIGMA_PX, triangulated
+from colmap_affrect.colmap.by_hand import AGREEING_SIGMAS, SIGMA_PX, triangulated
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.two_views import NUM_NEIGHBORS
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, sampling_step
 from colmap_affrect.project.report import Residual
 
 # Residuals up to which a tie point agrees with a pose; theory
-AGREEING_PX = 4.0 * SIGMA_PX
+AGREEING_PX = AGREEING_SIGMAS * SIGMA_PX
 # Shares of tie points that agree (judged).
 AGREES_IF_RIGHT = 0.9  # with right poses: some marks are wrong
 AGREES_BY_CHANCE = 0.05  # with wrong poses; judged
@@ -32,7 +33,6 @@ thirteen are right."""
 NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P); theory
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
 MARK_RADIUS = 0.1  # of the longer side of the image
-NUM_NEIGHBORS = 5  # judged
 # Of an image, among which neighbours are looked for, to save time; resource
 MAX_NUM_OBSERVED = 2_000
 

@@ -14,6 +14,7 @@ from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
+from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
 
 NUM_WORST = 3  # tie points that a summary names; display
 MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all; display
@@ -139,8 +140,18 @@ class StageReport(Summarized):
     """Those that were there already."""
     failures: dict[str, str] = field(default_factory=dict)
     """Why images cannot be used, by their names."""
-    warnings: dict[str, str] = field(default_factory=dict)
-    """What went less well than asked for, by what it is about."""
+    warned: tuple[StageWarning, ...] = ()
+    """What went less well than asked for."""
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What went less well than asked for, in words, by what it is about."""
+        return texts_by_subject(self.warned)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what ``report.json`` has of it."""
+        warned = [warning.to_mapping() for warning in self.warned]
+        return {**asdict(self), "warnings": self.warnings, "warned": warned}
 
     def summary(self) -> str:
         """Return one line."""
@@ -392,6 +403,7 @@ class ReconstructionReport(Summarized):
             "images_registered": len(largest.registered_names),
             **{key: of_largest[key] for key in OF_LARGEST},
             **found,
+            "stages": [stage.to_mapping() for stage in self.stages],
             "unregistered": missing,
             "unsure": mappings_of(largest.unsure),
             "doubtful": mappings_of(largest.doubtful),

@@ -24,7 +24,8 @@ from colmap_affrect.rectifiers import base
 from colmap_affrect.rectifiers.regions import Region
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
-# Parts of a region that are closer than this are warped together; judged
+# Parts of a region that are closer than this share a canvas: the margins of two would show the
+# same pixels twice; resource
 GAP_BLOCKS = 5
 
 
@@ -90,9 +91,14 @@ def plan_whole_image(
 ) -> RectificationPlan:
     """Warp an image as a whole by every tilt class.
 
+    A warp is stretched by the tilt along one direction of the photograph, against the direction
+    across: a class of angle 0 widens the photograph, one of pi / 2 makes it higher. The angle
+    turns from the right upwards, counterclockwise as one looks at the photograph.
+
     Args:
         image_size: (width, height) in px.
-        centers: (K, 2) rows (tilt, angle_rad).
+        centers: (K, 2) rows (tilt, angle_rad): by how much, and along which direction of the
+            photograph, from 0 up to pi.
         options: whether warps preserve areas.
 
     Returns:

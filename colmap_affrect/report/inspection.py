@@ -64,7 +64,7 @@ class InspectedLevel:
 
     photograph: Photograph
     plan: RectificationPlan
-    warning: str  # why the photograph was not rectified as asked; empty if it was
+    not_rectified: str  # why the photograph was not, as asked; empty if it was
     # by rectification id, 0 for the photograph itself: the view in which features were detected,
     # and all of them, LAFs in px of the view
     detected: Mapping[int, tuple[View, LocalFeatures]]
@@ -239,7 +239,8 @@ def inspect_image(
             name = extractor.options.levels[number].rectifier.name
             line = f"level {number}, {name}: {_summary(level)}"
             draw_sheet(level, line, sheet)
-            lines.append(f"{line}; {level.warning}" if level.warning else line)
+            why = level.not_rectified
+            lines.append(f"{line}; not rectified: {why}" if why else line)
         lines.append(_draw_lines(photographs[0], original_size, new_sheets[0]))
     return "\n".join([*lines, *map(str, sheets)])
 
@@ -268,7 +269,7 @@ def inspect_level(
         The plan, the views, and the features before and after their selection.
     """
     start = time.perf_counter()
-    plan, warning = extractor.plan(photograph, number)
+    plan, not_rectified = extractor.plan(photograph, number)
     recorder = _Recorder(extractor.extractors[number])
     extractors = {**extractor.extractors, number: recorder}
     recorded = replace(extractor, extractors=extractors)
@@ -277,7 +278,7 @@ def inspect_level(
     first_id = 0 if looks_at_photograph else 1
     detected = dict(enumerate(recorder.detected, first_id))
     seconds = time.perf_counter() - start
-    return InspectedLevel(photograph, plan, warning, detected, features, seconds)
+    return InspectedLevel(photograph, plan, not_rectified, detected, features, seconds)
 
 
 class _Recorder:

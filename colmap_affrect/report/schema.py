@@ -8,13 +8,8 @@ import pydantic
 from colmap_affrect.mappers.camera_priors import FocalContradiction
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import DoubtCode, MissingCode
-from colmap_affrect.project.report import (
-    Advice,
-    Bridge,
-    MatchedAgain,
-    Residual,
-    StageReport,
-)
+from colmap_affrect.project.report import Advice, Bridge, MatchedAgain, Residual
+from colmap_affrect.project.stage_warnings import WarningCode
 from colmap_affrect.report.photographs import PhotographReport
 
 
@@ -48,6 +43,38 @@ class MissingEntry(Described):
     """Inliers of its best verified pairs, by the other photograph."""
     doubts: list[DoubtEntry] = []
     """Why it was taken out of the model."""
+
+
+class WarningEntry(pydantic.BaseModel):
+    """What went less well: beside these three, the numbers and names that belong to it."""
+
+    model_config = pydantic.ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    code: WarningCode
+    """Kind of the warning."""
+    about: str
+    """An image, a file, a folder, or what else it is about."""
+    text: str
+    """The warning in words."""
+
+
+class StageEntry(Described):
+    """One stage of a run."""
+
+    name: str
+    """``extract``, ``pairs``, ``match``, ``verify``, ``escalate``, ``guide`` or ``map``."""
+    wall_s: float
+    """Seconds that it took."""
+    num_done: int
+    """Images, pairs, cameras or models that were made now."""
+    num_kept: int
+    """Those that were there already."""
+    failures: dict[str, str]
+    """Why images cannot be used, by their names."""
+    warnings: dict[str, str]
+    """What went less well than asked for, in words, by what it is about."""
+    warned: list[WarningEntry]
+    """The same with codes."""
 
 
 class CameraEntry(Described):
@@ -120,7 +147,7 @@ class ReportFile(Described):
     """Pairs with a two-view geometry."""
     num_pairs: int
     """Pairs that were to be matched."""
-    stages: list[StageReport]
+    stages: list[StageEntry]
     """What each stage did, and how long that took."""
     advice: list[Advice]
     """What to try next, the most promising first."""

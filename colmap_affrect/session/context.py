@@ -34,6 +34,7 @@ from colmap_affrect.project.guided_store import GuidedStore
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
@@ -153,14 +154,13 @@ class Inputs(Options):
                 "parameters, and other options of cameras"
             )
 
-    def check_names(self, names: Sequence[str]) -> dict[str, str]:
+    def check_names(self, names: Sequence[str]) -> list[StageWarning]:
         """Refuse photographs with the same key in hloc's files, or whose cameras cannot be.
 
         Returns what becomes of cameras otherwise than asked for, as a warning.
         """
         refuse_colliding_keys(names)
-        note = "" if self.from_database else self.initial_cameras.check(names)
-        return {"cameras": note} if note else {}
+        return [] if self.from_database else self.initial_cameras.check(names)
 
     @property
     def may_share(self) -> bool:

@@ -98,14 +98,16 @@ def match_feature_sets(
         raise OptionError(f"{min(unknown)}: is in a pair, and has no features")
     found = dict[Pair, Matches]()
     with progress.stage("match", len(listed), "pairs") as advance:
-        matched = iterate_matches(listed, lambda name: features[name], options)
+        matched = iterate_descriptor_matches(
+            listed, lambda name: features[name], options
+        )
         for pair, matches in matched:
             found[pair] = matches
             advance(1)
     return found
 
 
-def iterate_matches(
+def iterate_descriptor_matches(
     pairs: Sequence[Pair],
     read: Callable[[str], Arrays],
     options: NearestOptions | None = None,
@@ -260,7 +262,9 @@ def match_database(
 
         with progress.stage("match", len(todo), "pairs") as advance:
             try:
-                for (first, second), found in iterate_matches(todo, read, options):
+                for (first, second), found in iterate_descriptor_matches(
+                    todo, read, options
+                ):
                     colmap_database.write_matches(
                         database, ids[first], ids[second], found.indices
                     )

@@ -28,6 +28,7 @@ from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning, WarningCode
 from colmap_affrect.project.stores import NOT_KNOWN, FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
@@ -80,27 +81,27 @@ def extract(
     names = _names(inputs, image_names)
     known = {} if overwrite else context.features.contents()
     contents = inputs.contents(names, recipe.extraction, known)
-    warnings = dict[str, str]()
+    warned = list[StageWarning]()
     if contents != known:  # those that were there before were seen to be good
-        warnings |= inputs.check_names(names)
-    mask_warnings = _mask_warnings(inputs, names)
+        warned += inputs.check_names(names)
+    without_mask = _mask_warnings(inputs, names)
     resources = context.resources
     progress = context.progress
     extractor = one_image.prepare(recipe.extraction, resources, names, progress)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     _record(context, inputs, recipe, extractor, later=later or {}, overwrite=overwrite)
-    warnings |= _forget_changed(context, inputs, contents, are_all=not image_names)
+    warned += _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
     if not (inputs.image_list_path or image_names):
-        warnings |= _warnings_of_the_folder(inputs, names)
-    warnings |= mask_warnings
-    _log_warnings(warnings)
-    failures = _extract_missing(
-        context, inputs, extractor, names=missing, contents=contents, warnings=warnings
+        warned += _warnings_of_the_folder(inputs, names)
+    warned += without_mask
+    _log_warnings(warned)
+    failures, warned_of_images = _extract_missing(
+        context, inputs, extractor, names=missing, contents=contents
     )
     _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
@@ -110,7 +111,7 @@ def extract(
         num_done=len(set(missing) - failures.keys()),
         num_kept=len(done - failures.keys()),
         failures=failures,
-        warnings=warnings,
+        warned=(*warned, *warned_of_images),
     )
 
 
@@ -165,17 +166,30 @@ def _record(
     )
 
 
-def _mask_warnings(inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
+def _mask_warnings(inputs: Inputs, names: Sequence[str]) -> list[StageWarning]:
     """Return a warning of the images that have no mask where masks are given."""
     whole = inputs.photographs.without_mask(names)
     if not whole:
-        return {}
-    return {
-        "masks": f"{len(whole)} images have none and are used whole, as {whole[0]} is"
-    }
+        return []
+    return [_warning_of("no_mask", "masks", whole)]
 
 
-def _warnings_of_the_folder(inputs: Inputs, names: Sequence[str]) -> dict[str, str]:
+def _warning_of(
+    code: WarningCode, about: str, names: Sequence[str], **values: int
+) -> StageWarning:
+    """Return a warning of images, with their number and the first of them.
+
+    Args:
+        code: of the warning.
+        about: what it begins with.
+        names: of the images.
+        values: other numbers that belong to it.
+    """
+    found: dict[str, int | str] = {"num": len(names), "example": one_line(names[0])}
+    return StageWarning(code, about, {**found, **values})
+
+
+def _warnings_of_the_folder(inputs: Inputs, names: Sequence[str]) -> list[StageWarning]:
     """Return warnings of the photographs of the folder that are not used."""
     folder = Path(inputs.image_path)
     if inputs.from_database:
@@ -183,10 +197,10 @@ def _warnings_of_the_folder(inputs: Inputs, names: Sequence[str]) -> dict[str, s
     return left_out(folder)
 
 
-def _log_warnings(warnings: Mapping[str, str]) -> None:
-    """Log what the user should know of the photographs, by kind."""
-    for kind, what in warnings.items():
-        logger.warning("%s: %s", kind, what)
+def _log_warnings(warned: Iterable[StageWarning]) -> None:
+    """Log what the user should know of the photographs."""
+    for warning in warned:
+        logger.warning("%s", warning.line())
 
 
 def _extract_missing(
@@ -195,12 +209,12 @@ def _extract_missing(
     extractor: ImageExtractor,
     names: Sequence[str],
     contents: Mapping[str, Content],
-    warnings: dict[str, str],
-) -> dict[str, str]:
-    """Extract images one by one; return why some cannot be used, and add to the warnings."""
+) -> tuple[dict[str, str], list[StageWarning]]:
+    """Extract images one by one; return why some cannot be used, and warnings of others."""
     store = context.features
     images = [(name, 0) for name in names]
     failures = dict[str, str]()
+    warned = list[StageWarning]()  # of single images, which are logged one by one
     faded = list[str]()
     white = list[str]()  # images whose mask leaves out nothing
     with (
@@ -214,8 +228,7 @@ def _extract_missing(
             else:
                 if not len(found.features):
                     logger.warning("%s: no features (blank or too small?)", name)
-                if found.warning:
-                    warnings[name] = found.warning
+                warned += _warnings_of_image(name, found)
                 if found.stretched:
                     faded.append(name)
                 if found.mask_is_white:
@@ -228,20 +241,21 @@ def _extract_missing(
                     lines=found.lines,
                 )
             advance(1)
-    more = dict[str, str]()
+    more = list[StageWarning]()
     if faded:
-        more["contrast"] = (
-            f"is low in {len(faded)} of {len(names)} photographs, such as {one_line(faded[0])}; it "
-            "was stretched (--set stretch_contrast=false leaves it as it is)"
-        )
+        num = len(names)
+        more.append(_warning_of("low_contrast", "contrast", faded, num_images=num))
     if white:
-        more["white masks"] = (
-            f"{len(white)} masks are white all over, such as that of {one_line(white[0])}, and "
-            "leave out nothing; black is where features are not wanted"
-        )
+        more.append(_warning_of("white_masks", "white masks", white))
     _log_warnings(more)
-    warnings.update(more)
-    return failures
+    return failures, warned + more
+
+
+def _warnings_of_image(name: str, found: ExtractedImage) -> list[StageWarning]:
+    """Return a warning of an image that was not rectified."""
+    if not found.not_rectified:
+        return []
+    return [StageWarning("not_rectified", name, {"reason": found.not_rectified})]
 
 
 def extract_images(
@@ -278,8 +292,7 @@ def extract_images(
     for (name, level), found in zip(images, extracted, strict=True):
         if isinstance(found, ExtractedImage):
             logger.debug("%s: %d features (level %d)", name, len(found.features), level)
-            if found.warning:
-                logger.warning("%s: %s", name, found.warning)
+            _log_warnings(_warnings_of_image(name, found))
         yield found
 
 
@@ -365,12 +378,12 @@ def _changed(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[s
 
 def _forget_changed(
     context: Context, inputs: Inputs, contents: Mapping[str, Content], *, are_all: bool
-) -> dict[str, str]:
+) -> list[StageWarning]:
     """Remove what was made from inputs that have changed since, so that it is made again.
 
     The changed images lose their features last: a run that is killed before finds them changed
     again. ``contents`` are those of each image now; ``are_all`` says that there are no other
-    images. Returns one line by the folder of the photographs, empty if nothing has changed.
+    images. Returns a warning, none if nothing has changed.
     """
     workspace = context.workspace
     known = context.features.contents()
@@ -394,8 +407,13 @@ def _forget_changed(
     _record_new_stamps(context, contents, known)
     workspace.record_input_digests(cameras=cameras)
     if not reasons:
-        return {}
-    return {inputs.image_path: f"{why}; all that hangs on them is made again"}
+        return []
+    values: dict[str, int | str] = {
+        "what": why,
+        "num_changed": len(changed),
+        "num_gone": len(gone),
+    }
+    return [StageWarning("inputs_changed", inputs.image_path, values)]
 
 
 def _record_new_stamps(

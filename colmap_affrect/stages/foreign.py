@@ -31,6 +31,7 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import as_path_or_none, resolved
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.session.context import Context, source_files
 from colmap_affrect.stages.descriptors import (
     described_images,
@@ -141,7 +142,7 @@ def import_and_verify(
     workspace = context.workspace
     foreign.check()
     workspace.require_own(foreign.image_path)
-    warnings = _update_copy(context, foreign, overwrite=overwrite)
+    warned = _update_copy(context, foreign, overwrite=overwrite)
     workspace.record_options("verify", verification.to_mapping())
     _match(context, foreign)
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
@@ -153,13 +154,13 @@ def import_and_verify(
         wall_s=time.perf_counter() - start,
         num_done=num_verified,
         num_kept=num_pairs - num_verified,
-        warnings=warnings,
+        warned=warned,
     )
 
 
 def _update_copy(
     context: Context, foreign: ForeignDatabase, *, overwrite: bool
-) -> dict[str, str]:
+) -> tuple[StageWarning, ...]:
     """Make the copy, unless it is there and made from the same files; return a warning."""
     workspace = context.workspace
     source = foreign.path
@@ -167,12 +168,13 @@ def _update_copy(
     if digest != workspace.input_digest("copy") or not workspace.database.exists():
         refuse_unusable(source, warns=True)
     workspace.record_options("copy", options=foreign.to_record(), overwrite=overwrite)
-    warnings = {}
+    warned: tuple[StageWarning, ...] = ()
     before = workspace.input_digest("copy")
     if digest != before:
         if before:
-            warnings[str(source)] = "has changed; its copy and the models are made anew"
-            logger.warning("%s: %s", source, warnings[str(source)])
+            warning = StageWarning("database_changed", str(source))
+            logger.warning("%s", warning.line())
+            warned = (warning,)
         workspace.rewind()
         context.graph.forget()
         workspace.record_input_digests(copy=digest)
@@ -181,7 +183,7 @@ def _update_copy(
         context.graph.forget()
         record_cameras(context.graph.cameras, workspace.cameras, known=known)
     record_cameras(context.graph.cameras, workspace.cameras)
-    return warnings
+    return warned
 
 
 def _verify(

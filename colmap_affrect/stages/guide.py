@@ -189,7 +189,7 @@ class Guiding:
         return todo, num_done
 
     def _escalated(self, pairs: Sequence[Pair]) -> set[frozenset[str]]:
-        """Return the images of those pairs that were matched again, and have enough."""
+        """Return those pairs, as sets, that were matched again: they need no guided matching."""
         if not pairs:
             return set()
         asked = set(map(frozenset, pairs))
@@ -286,7 +286,7 @@ class Guiding:
                 frames=(features.read_frames(first), features.read_frames(second)),
                 indices=matches,
             )
-            if _is_better(geometry, task):
+            if is_better(geometry, task):
                 geometries[task.names] = geometry
         pairs = []
         for task, _ in found:
@@ -312,7 +312,7 @@ class Guiding:
                 )
 
 
-def _is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:
+def is_better(geometry: pycolmap.TwoViewGeometry, task: GuidedTask) -> bool:
     """Tell whether a geometry has more inliers, and is still that of the exact matches.
 
     Where structure repeats, guided matches may outvote them: exact inliers then fall out, or the

@@ -40,6 +40,7 @@ from colmap_affrect.pairs.lists import (
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import (
     PAIRS_PER_WRITE,
     FeatureStore,
@@ -62,7 +63,9 @@ MANY_MATCHES = 300
 NUM_TRIED = 40  # pairs matched by all features before many are; resource
 # Of the matches that confirm each other, by all features; small scans have none; judged
 MIN_GROWTH = 1.1
-NUM_WELL_TIED = 3  # pairs with many matches, of an image that needs no others; judged
+# Pairs with many matches, beside which others of an image are matched by no more features: this
+# saves time; resource
+NUM_WELL_TIED = 3
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process; resource
 # Of a feature ready for matching, with descriptors of 128 and coarse ones; measured
 BYTES_PER_FEATURE = 870
@@ -97,9 +100,7 @@ def match(
         write_matches(context, database, pairs)
     wall_s = time.perf_counter() - start
     num_before = len(pairs) - missing.num
-    return StageReport(
-        "match", wall_s, missing.num, num_before, warnings=missing.warnings
-    )
+    return StageReport("match", wall_s, missing.num, num_before, warned=missing.warned)
 
 
 def _record_options(
@@ -122,7 +123,7 @@ class _Missing:
     """Pairs that were not matched before."""
 
     num: int
-    warnings: dict[str, str]
+    warned: tuple[StageWarning, ...]
 
 
 def _match_missing(
@@ -146,16 +147,15 @@ def _match_missing(
         left = _worth_all_features(context, wanted, options, digest)
         advance(len(wanted) - len(left))
         match_pairs(context, left, options, advance)
-    warnings = dict[str, str]()
+    warned = list[StageWarning]()
     has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
-        line = StationaryFilter(context.features, matches).learn(pairs)
-        if line:
-            warnings["matches"] = line
-            logger.warning("matches: %s", line)
+        warned = StationaryFilter(context.features, matches).learn(pairs)
+        for warning in warned:
+            logger.warning("%s", warning.line())
     if finished != digest:
         matches.update_state(listed=digest)
-    return _Missing(len(missing), warnings)
+    return _Missing(len(missing), tuple(warned))
 
 
 def load_matchers(
@@ -242,13 +242,24 @@ def _worth_all_features(
             by_all = list(found)
         num_after = _sum_confirming(context.features, by_all)
         num_before = _sum_confirming(context.features, matches.read(sample))
-        is_in_vain = num_after < MIN_GROWTH * num_before
+        is_in_vain = brings_nothing(num_before, num_after)
         known = (digest, is_in_vain)
         matches.choose([] if is_in_vain else by_all, {}, in_vain=known)
     if known == (digest, True):
         return []
     done = set(sample)
     return [pair for pair in pairs if pair not in done]
+
+
+def brings_nothing(num_before: int, num_after: int) -> bool:
+    """Tell whether matching by all features is in vain, by confirmed matches of a sample.
+
+    >>> brings_nothing(100, 109), brings_nothing(100, 111), brings_nothing(100, 200)
+    (True, False, False)
+    >>> brings_nothing(0, 0), brings_nothing(0, 1)
+    (True, False)
+    """
+    return num_after == 0 or num_after < MIN_GROWTH * num_before
 
 
 def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:

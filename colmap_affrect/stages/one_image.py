@@ -59,7 +59,7 @@ class ExtractedImage:
 
     features: LocalFeatures  # frames in px of the stored image
     image_size: tuple[int, int]  # (width, height) of the stored image in px
-    warning: str = ""  # why it was not rectified; empty if all went well
+    not_rectified: str = ""  # why it was not; empty if all went well
     stretched: bool = False  # whether its contrast was low and was stretched
     mask_is_white: bool = False  # whether it has a mask, which leaves out nothing
     lines: Lines | None = None  # straight ones; None where they were not asked for
@@ -156,7 +156,7 @@ class ImageExtractor:
         photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         uses_networks = self.options.levels[level].uses_networks
         with self.network_lock if uses_networks else nullcontext():
-            plan, warning = self.plan(photograph, level)
+            plan, not_rectified = self.plan(photograph, level)
             features = self.execute(photograph, plan, level)
         if photograph.size != original_size:
             resized = resized_from_original(original_size, photograph.size)
@@ -169,7 +169,7 @@ class ImageExtractor:
         return ExtractedImage(
             features=features.select(keep),
             image_size=original_size,
-            warning=warning,
+            not_rectified=not_rectified,
             stretched=photograph.stretched,
             lines=lines_of(photograph.gray, photograph.mask) if with_lines else None,
         )
@@ -236,7 +236,7 @@ class ImageExtractor:
         try:
             return self.rectifiers[level].plan(photograph), ""
         except DepthError as error:
-            return RectificationPlan(photograph.size), f"not rectified: {error}"
+            return RectificationPlan(photograph.size), str(error)
 
     def execute(
         self, photograph: Photograph, plan: RectificationPlan, level: int = 0

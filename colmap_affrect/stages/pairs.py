@@ -14,6 +14,7 @@ from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.record import content_of
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import write_images_and_keypoints
 
@@ -62,14 +63,14 @@ def choose_pairs(
     if workspace.input_digest("pairs") not in ("", digest):
         kept = set()
     pairs |= kept | _similar_pairs(context, options, there=kept)
-    warnings = _forget_lost(context, there - pairs)
+    warned = _forget_lost(context, there - pairs)
     lists.write_pairs(workspace.pairs, sorted(pairs))
     workspace.record_input_digests(pairs=digest)
     return StageReport(
         name="pairs",
         wall_s=time.perf_counter() - start,
         num_done=len(pairs),
-        warnings=warnings,
+        warned=warned,
     )
 
 
@@ -177,15 +178,18 @@ def _pairs_there(context: Context) -> set[Pair]:
     return set(context.listed_pairs()) if has_pairs else set()
 
 
-def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
+def _forget_lost(context: Context, lost: Collection[Pair]) -> tuple[StageWarning, ...]:
     """Have a database made without the pairs that are not to be matched any more."""
     if not lost:
-        return {}
+        return ()
     context.workspace.rewind()
     context.graph.forget()
     context.matches.remove(pairs=lost)
-    why = (
-        f"{len(lost)} pairs are not listed any more, such as {' and '.join(min(lost))}"
+    first, second = min(lost)
+    warning = StageWarning(
+        "pairs_not_listed",
+        str(context.workspace.pairs),
+        {"num": len(lost), "first": first, "second": second},
     )
-    logger.warning("%s: %s", context.workspace.pairs, why)
-    return {str(context.workspace.pairs): why}
+    logger.warning("%s", warning.line())
+    return (warning,)

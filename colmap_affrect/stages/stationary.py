@@ -25,6 +25,7 @@ from colmap_affrect.geometry.stationary import (
 from colmap_affrect.images.reading import grow_mask
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
@@ -57,12 +58,7 @@ MIN_SHARE_OF_BACKGROUND = 0.8
 """Matches that stand still, of all matches of one photograph in a cell that shows the background
 there, four in five: where something turns before it, they move (judged)."""
 
-WHAT = "a caption, a frame, a watermark, or the background of something that turns"
-CAMERA_STANDS_STILL = (
-    "nothing moves between most photographs, so that matches tell nothing of depth: the camera "
-    "stands still; take photographs from several places, or give masks of what stands still "
-    "(--mask-path) where something turns before it"
-)
+SUBJECT = "matches"  # of the warnings
 
 
 @dataclass(frozen=True)
@@ -89,13 +85,15 @@ class _Votes:
     def background(self, places: Mask) -> Mask:
         """Return the cells, of places where nothing moves, that show what stands still."""
         is_most = self.still >= MIN_SHARE_OF_BACKGROUND * (self.still + self.moving)
-        return places & is_most & (self.still >= MIN_NUM_PAIRS)
+        has_enough = self.still >= MIN_NUM_PAIRS  # matches: as many as pairs elsewhere
+        return places & is_most & has_enough
 
 
 class StationaryFilter:
     """Drops the matches of pairs that lie where nothing moves.
 
-    Where that is the file of matches knows, as long as it exists.
+    Where that is, it reads from the file of matches when it is made; `learn` finds it and puts it
+    on record there.
     """
 
     def __init__(self, features: FeatureStore, matches: MatchStore) -> None:
@@ -166,20 +164,20 @@ class StationaryFilter:
                 found |= _at(background, cells)
         return found
 
-    def learn(self, pairs: Sequence[Pair]) -> str:
-        """Look for places in all matches, and drop those there; return a line, empty if none.
+    def learn(self, pairs: Sequence[Pair]) -> list[StageWarning]:
+        """Look for places in all matches, and drop those there; return a warning, or none.
 
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
         found = self._find(pairs)
-        idle = ""
+        idle = list[StageWarning]()
         for size, places in found.items():
             if not places.still.any():
                 continue
             if places.is_most and not self._moves_elsewhere(
                 pairs, size, places=places.still
             ):
-                idle = CAMERA_STANDS_STILL
+                idle = [StageWarning("camera_stands_still", SUBJECT)]
             else:
                 self._places[size] = places.still | self._places.get(size, places.still)
                 if places.is_most_exact:
@@ -198,10 +196,11 @@ class StationaryFilter:
                 num_matches += len(before.indices) - len(after.indices)
         if not num_pairs:
             return idle
-        return (
-            f"{num_matches} matches of {num_pairs} pairs never move ({WHAT}?) and were left out "
-            "(--set matching.filter_stationary_matches=false keeps them)"
-        )
+        values: dict[str, int | str] = {
+            "num_matches": num_matches,
+            "num_pairs": num_pairs,
+        }
+        return [StageWarning("stationary_matches", SUBJECT, values)]
 
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""

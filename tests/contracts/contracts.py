@@ -5,13 +5,19 @@ Subclass, say how a part is made, and pytest runs the rest.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from small_scene import INTRINSICS, NAMES
 from synthetic import texture, unit_rows
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import (
     GrayImage,
     LocalFeatures,
@@ -20,10 +26,23 @@ from colmap_affrect.data import (
     RectificationPlan,
     View,
 )
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_lafs
 from colmap_affrect.geometry.conventions import camera_matrix, is_inside
+from colmap_affrect.geometry.tilts import (
+    metrics_from_tilts,
+    unit_metrics,
+)
+from colmap_affrect.mappers.base import (
+    MAPPERS,
+    MappedModel,
+    Mapper,
+    MapperOptions,
+    MappingTask,
+)
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.base import ImageFeatures, Matcher
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import Rectifier
@@ -37,6 +56,8 @@ MAX_WARPED_AREAS = 100.0
 """Canvas areas of all warps of an image together, in image areas: the 24 of the near-optimal
 cover at full area, each in a rotated bounding box, with room."""
 NUM_THINGS = 60
+METRIC_ERROR = 1e-6
+"""Of the metric of a warp in the middle of its region, in float64."""
 
 IMAGES = {
     "textured": texture((117, 163), 7),
@@ -227,6 +248,18 @@ def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
         [np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2
     )
     assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
+    check_direction(item, points.mean(axis=0))
+
+
+def check_direction(item: Rectification, middle: np.ndarray) -> None:
+    """A warp is stretched as it says, by its tilt, and along the direction that it says.
+
+    A map the wrong way round, from the warp to the photograph, shrinks in that direction.
+    """
+    frame = np.concatenate([np.eye(2), middle[:, None]], axis=1)
+    (mapped,) = transform_lafs(item.rectified_from_image, frame[None])
+    said = metrics_from_tilts([item.tilt], [item.tilt_angle_rad])
+    assert_allclose(unit_metrics(mapped[None, :, :2]), said, atol=METRIC_ERROR)
 
 
 def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> None:
@@ -236,3 +269,79 @@ def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> Non
         assert one.canvas_size == other.canvas_size
         assert one.region_origin == other.region_origin
         np.testing.assert_equal(one.region, other.region)
+
+
+class MapperContract(Contract):
+    """Of a mapper."""
+
+    def options(self) -> MapperOptions:
+        """Return the options of the mapper under test."""
+        raise NotImplementedError
+
+    def make(self) -> Mapper:
+        return MAPPERS.make(self.options())
+
+    def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
+        self, task: MappingTask, tmp_path: Path
+    ) -> None:
+        shown: list[int] = []
+        (model, *_) = map_database(self.make(), task, tmp_path / "sparse", shown.append)
+        assert model.registered_names == tuple(sorted(NAMES))
+        assert sum(shown) == len(NAMES)
+        assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+        written = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+        (camera,) = written.cameras.values()
+        given = [float(value) for value in INTRINSICS.split(",")]
+        assert camera.params.tolist() == given, "a given camera has changed"
+
+    def test_mapper_has_presets_and_refuses_unknown_options(self) -> None:
+        options = self.options().changed(random_seed=5, mapper_options={})
+        colmap = type(options).preset("colmap")
+        assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")
+        with pytest.raises(OptionError, match="no such option"):
+            MAPPERS.make(options.changed(mapper_options={"nonsense": 1}))
+
+    def test_mapper_makes_no_model_or_says_why_where_no_pair_is_verified(
+        self, unmatched_task: MappingTask, tmp_path: Path
+    ) -> None:
+        found: list[MappedModel] = []
+        with suppress(AffrectError):
+            found = self.make().map(unmatched_task, tmp_path, 0, lambda _: None)
+        assert found == []
+
+    def test_mapper_that_is_stopped_raises_and_leaves_no_model(
+        self, task: MappingTask, tmp_path: Path
+    ) -> None:
+        token = pycolmap.CancellationToken()
+        token.cancel()
+        stopped = replace(task, cancellation=token)
+        with pytest.raises(KeyboardInterrupt):
+            map_database(self.make(), stopped, tmp_path / "sparse", lambda _: None)
+        assert not (tmp_path / "sparse").exists()
+
+    @pytest.mark.long
+    def test_mapper_makes_the_same_model_in_two_threads_at_once(
+        self, task: MappingTask, tmp_path: Path
+    ) -> None:
+        """Neither is the main one, which alone may handle signals."""
+        mapper = self.make()
+
+        def poses(number: int) -> dict[str, list[float]]:
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            (model, *_) = mapper.map(task, folder, 0, lambda _: None)
+            return poses_by_name(model.reconstruction)
+
+        with ThreadPoolExecutor(2) as threads:
+            first, second = threads.map(poses, (1, 2))
+        assert first.keys() == set(NAMES)
+        assert first == second
+
+
+def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, list[float]]:
+    """Return the matrix of each registered image in one row."""
+    found = {}
+    for image in model.images.values():
+        if image.has_pose:
+            found[image.name] = image.cam_from_world().matrix().ravel().tolist()
+    return found

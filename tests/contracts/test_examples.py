@@ -12,8 +12,12 @@ from types import ModuleType
 
 import pytest
 import small_run
-from contracts import test_mappers
-from contracts.contracts import ExtractorContract, MatcherContract, RectifierContract
+from contracts.contracts import (
+    ExtractorContract,
+    MapperContract,
+    MatcherContract,
+    RectifierContract,
+)
 from small_comparison import make_comparison
 from small_scene import NAMES
 from synthetic import texture, write_image
@@ -22,7 +26,7 @@ from colmap_affrect.comparison import results, tables
 from colmap_affrect.errors import OptionError
 from colmap_affrect.escalation.expected_gain import kind_of
 from colmap_affrect.features.base import EXTRACTORS, FeatureExtractor, NetworkContext
-from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
@@ -55,9 +59,12 @@ def example(name: str) -> tuple[str, str, str]:
 
 
 @pytest.fixture(autouse=True)
-def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _installed(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A package on the path, as pip leaves it, with the lines that the text gives for each part."""
-    info = tmp_path / "other_affrect-1.0.dist-info"
+    folder = tmp_path_factory.mktemp("installed")
+    info = folder / "other_affrect-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: other-affrect\nVersion: 1.0\n"
@@ -66,11 +73,11 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, registry in PARTS.items():
         path, code, part = example(name)
         module = Path(path).stem
-        (tmp_path / f"{module}.py").write_text(code, encoding="utf-8")
+        (folder / f"{module}.py").write_text(code, encoding="utf-8")
         points.append(f"[{registry.group}]\n{name} = {module}:{part}\n")
         monkeypatch.delitem(sys.modules, module, raising=False)
     (info / "entry_points.txt").write_text("\n".join(points))
-    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend(folder)
 
 
 class TestMutual(MatcherContract):
@@ -86,6 +93,11 @@ class TestOrb(ExtractorContract):
 class TestAlongStreet(RectifierContract):
     def make(self) -> Rectifier:
         return RECTIFIERS.make(RECTIFIERS.options("along-street"), RectifierInputs())
+
+
+class TestPlain(MapperContract):
+    def options(self) -> MapperOptions:
+        return MAPPERS.options("plain")
 
 
 def test_new_rectifier_is_escalated_to_as_what_it_declares_to_be() -> None:
@@ -146,20 +158,24 @@ def patched(folder: Path) -> list[Path]:
     """Apply the example of a column to copies of the files that it changes; return these."""
     found = re.search(r"```diff\n(.*?)```", TEXT, re.DOTALL)
     assert found is not None
-    lines = found[1].splitlines()
     paths: list[Path] = []
-    for line, after in zip(lines, [*lines[1:], ""], strict=True):
+    old = new = ""
+    for line in [*found[1].splitlines(), "---"]:
+        is_added = line.startswith("+") and not line.startswith("+++")
+        if is_added:
+            new += line[1:] + "\n"
+            continue
+        if new:
+            text = paths[-1].read_text(encoding="utf-8")
+            assert text.count(old) == 1, old
+            changed = text.replace(old, new.removesuffix("\n"))
+            paths[-1].write_text(changed, encoding="utf-8")
         if line.startswith("+++ b/"):
             source = ROOT / line.removeprefix("+++ b/")
             paths.append(folder / source.name)
             shutil.copy(source, paths[-1])
-        elif not line.startswith(("---", "+", "@@")) and after.startswith("+"):
-            text = paths[-1].read_text(encoding="utf-8")
-            old = line[1:]
-            new = after[1:]
-            assert text.count(old) == 1, old
-            kept = f"{old}\n" if line.startswith(" ") else ""
-            paths[-1].write_text(text.replace(old, kept + new), encoding="utf-8")
+        old = line[1:]
+        new = f"{old}\n" if line.startswith(" ") else ""
     return paths
 
 
@@ -178,11 +194,14 @@ def test_new_column_of_cameras_is_in_report_and_page(
 ) -> None:
     templates = tmp_path / "templates"
     shutil.copytree(run_page.TEMPLATES, templates)
-    cameras, _ = patched(templates)
+    cameras, schema, _ = patched(templates)
     monkeypatch.setattr(run_page, "TEMPLATES", templates)
     record = loaded(cameras).CameraRecord(("a.png",), "exif", 200.0, size=(320, 240))
     camera = record.to_report(1, None)
     assert camera["size_px"] == [320, 240]
+    described = loaded(schema)
+    assert described.CameraEntry(**camera).size_px == (320, 240)
+    assert '"size_px"' in described.report_schema()
     report = small_run.small_report(tmp_path)
     changed = report.__class__(**vars(report) | {"cameras": (camera,)})
     monkeypatch.setattr(small_run, "small_report", lambda _: changed)
@@ -201,18 +220,6 @@ def test_new_column_of_comparisons_is_in_their_table(
     comparison = make_comparison(tmp_path)
     columns = tables.table(comparison)
     assert len(columns["models"]) == len(comparison.finished)
-
-
-task = test_mappers.task
-
-
-def test_new_mapper_keeps_the_contract(task: MappingTask, tmp_path: Path) -> None:
-    own = tmp_path / "own"
-    own.mkdir()
-    test_mappers.test_mapper_registers_tells_of_it_and_keeps_given_cameras(
-        "plain", task, own
-    )
-    test_mappers.test_mapper_has_presets_and_refuses_unknown_options("plain")
 
 
 def test_new_extractor_and_matcher_are_chosen_by_name(tmp_path: Path) -> None:

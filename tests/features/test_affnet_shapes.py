@@ -260,3 +260,13 @@ def test_samples_are_the_network_on_patches_of_12_sigma(image: GrayImage) -> Non
     assert_array_equal(samples.points, keypoints.keypoints)
     # The patches are sampled at pixels, up to rounding.
     assert_allclose(samples.metrics, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_default_shapes_are_those_of_the_whole_image_its_half_and_its_quarter() -> None:
+    image = texture((120, 160), seed=4)
+    network = random_network()
+    default = source(network).grid(image).metrics
+    expected = source(network, scales=(1.0, 0.5, 0.25)).grid(image).metrics
+    assert_array_equal(default, expected)
+    whole = source(network, scales=(1.0,)).grid(image).metrics
+    assert not np.allclose(default, whole, atol=0.01)

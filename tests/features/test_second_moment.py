@@ -79,3 +79,13 @@ def test_textured_blocks_lie_round_the_texture() -> None:
     rows, columns = np.nonzero(grid.textured)
     middle = np.array([columns.mean(), rows.mean()]) * grid.step_px + grid.origin_px
     assert_allclose(middle, [217.5, 55.5], atol=2.0)
+
+
+@pytest.mark.parametrize(("step", "has_texture"), [(0.5, False), (3.0, True)])
+def test_a_slope_of_less_than_one_gray_value_a_pixel_is_no_texture(
+    step: float, has_texture: bool
+) -> None:
+    row = np.rint(10.0 + step * np.arange(80)).astype(np.uint8)
+    grid = SOURCE.grid(np.tile(row, (64, 1)))
+    assert bool(grid.textured[4:-4, 4:-4].all()) == has_texture
+    assert bool(grid.textured[4:-4, 4:-4].any()) == has_texture

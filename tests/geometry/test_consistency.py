@@ -62,6 +62,23 @@ def test_lafs_that_contradict_the_positions_support_nothing() -> None:
     assert num_consistent_matches(first, second) == 0
 
 
+def test_matches_that_are_a_tenth_of_their_distance_off_support_each_other() -> None:
+    """Surfaces are not plane, and keypoints not exact."""
+    first = random_lafs(40, 1)
+    first[:, :, 2] /= [6.0, 4.0]
+    second = mapped(first)
+    second[:, :, 2] += np.random.default_rng(5).normal(0.0, 3.0, (40, 2))
+    assert num_consistent_matches(first, second) > 34
+
+
+def test_matches_ten_pixels_apart_support_each_other() -> None:
+    """They are of several points; those at one position are of one."""
+    first = random_lafs(25, 6)
+    columns, rows = np.meshgrid(np.arange(5), np.arange(5))
+    first[:, :, 2] = 300.0 + 9.0 * np.stack([columns.ravel(), rows.ravel()], axis=1)
+    assert num_consistent_matches(first, mapped(first)) == 25
+
+
 def test_matches_at_one_position_are_no_neighbours() -> None:
     first = random_lafs(30, 4)
     first[:, :, 2] = 500.0 + first[:, :, 2] / 1000.0

@@ -61,8 +61,10 @@ def test_thick_or_oblique_bands_are_no_text_line(
 
 def test_line_of_inexact_matches_is_no_print() -> None:
     points = caption(height_px=6.0, angle_deg=0.0)
-    found = text_line_matches(points, points + SHIFT_PX + noise(4.0, 60), SIZES)
-    assert np.count_nonzero(found) < 30
+    for sigma_px in (1.5, 4.0):
+        others = points + SHIFT_PX + noise(sigma_px, 60)
+        found = text_line_matches(points, others, SIZES)
+        assert np.count_nonzero(found) < 35
 
 
 def copies(num_wrong: int, sigma_px: float) -> tuple[Array, Array]:
@@ -117,7 +119,7 @@ def test_images_without_texture_do_not_correlate() -> None:
 
 
 def test_windows_of_little_contrast_are_compared_too() -> None:
-    photograph = gray_texture(7, 15.0)
+    photograph = gray_texture(7, 10.0)
     assert correlation(photograph, photograph, np.eye(3)) > 0.99
 
 

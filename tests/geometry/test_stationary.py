@@ -83,3 +83,9 @@ def test_matches_of_an_object_move_together_and_wrong_ones_do_not() -> None:
     assert num_moving_together(places, turned - places, 20.0) > 180
     assert num_moving_together(points(200), anywhere - points(200), 20.0) < 5
     assert num_moving_together(points(0), points(0), 20.0) == 0
+
+
+def test_motions_of_one_object_differ_by_less_than_half_of_the_distance() -> None:
+    places = points(200) / 5.0
+    assert num_moving_together(places, 0.2 * places, 20.0) > 180
+    assert num_moving_together(places, 0.9 * places, 20.0) == 0

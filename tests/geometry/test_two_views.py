@@ -153,3 +153,28 @@ def test_moved_camera_is_no_turned_one() -> None:
         seen = (scene - center) @ (MATRIX @ matrix).T
         views.append(seen[:, :2] / seen[:, 2:])
     assert pure_rotation_ratio(views[0], views[1], SIZES, 2.0) < 0.3
+
+
+def test_depth_that_is_wrong_beside_a_position_does_not_hide_the_others_there() -> None:
+    """A position agrees where one of the five known depths next to it does."""
+    random = np.random.default_rng(5)
+    known = random.uniform(0, 1000, (2000, 2))
+    known_depths = depth_at(known)
+    is_wrong = random.random(len(known)) < 0.5
+    known_depths[is_wrong] *= np.exp(random.uniform(-2, 2, is_wrong.sum()))
+    places = random.uniform(100, 900, (300, 2))
+    found = scale_between((known, known_depths), (places, depth_at(places)), 60.0)
+    assert found is not None
+    assert found.scale == pytest.approx(1.0, rel=0.03)
+    assert found.share > 0.9
+
+
+def test_depths_beyond_the_nearest_do_not_make_a_scale_by_chance() -> None:
+    """Each of many depths that have nothing in common agrees with any scale now and then."""
+    random = np.random.default_rng(6)
+    known = random.uniform(0, 1000, (4000, 2))
+    places = random.uniform(100, 900, (300, 2))
+    known_depths = np.exp(random.uniform(-2, 2, len(known)))
+    found = scale_between((known, known_depths), (places, np.ones(300)), 100.0)
+    assert found is not None
+    assert found.share < 0.4

@@ -48,6 +48,8 @@ def test_cameras_that_are_held_otherwise_contradict() -> None:
     assert agreed_up(directions, -directions) is None
     in_all_ways = np.concatenate([np.eye(3), -np.eye(3)])
     assert agreed_up(directions, in_all_ways) is not None
+    nearly_in_all_ways = np.concatenate([in_all_ways, sideways[:1]])
+    assert agreed_up(directions, nearly_in_all_ways) is not None
 
 
 def test_z_points_up_and_y_ahead() -> None:

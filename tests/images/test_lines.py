@@ -84,3 +84,14 @@ def test_the_camera_of_a_drawing_is_found() -> None:
     assert camera.is_known
     assert abs(np.log(camera.focal / 0.85)) < 0.1
     assert camera.up @ -building.rotation[:, 1] > np.cos(np.deg2rad(2.0))
+
+
+def test_strokes_of_a_hundredth_of_the_picture_are_no_lines() -> None:
+    """Stones and leaves have such edges; windows are longer."""
+    image = np.full((700, 1000), 230, np.uint8)
+    for x in range(100, 900, 60):
+        for y in range(100, 600, 60):
+            cv2.line(image, (x, y), (x + 8, y + 5), 30, 2, cv2.LINE_AA)
+    assert len(segments_of(image)) == 0
+    cv2.line(image, (110, 80), (140, 86), 30, 2, cv2.LINE_AA)
+    assert len(segments_of(image)) > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,7 @@ from colmap_affrect.images.photographs import (
     photograph_files,
 )
 from colmap_affrect.images.reading import read_mask, read_photograph, shrink_mask
+from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
 from colmap_affrect.project.stores import FeatureStore
 
 
@@ -231,11 +233,10 @@ def test_list_images_refuses_a_list_of_what_is_not_there(
 
 def test_videos_are_named_with_what_to_do(photo_path: Path) -> None:
     touch(photo_path.parent, "film.MP4", "side.mov")
-    found = left_out(photo_path.parent)
-    assert set(found) == {"*.mp4", "*.mov"}
-    assert found["*.mp4"].startswith(
-        "1 left out, such as film.MP4: it is a video; take"
-    )
+    assert left_out(photo_path.parent) == [
+        StageWarning("video", "*.mp4", {"num": 1, "example": "film.MP4"}),
+        StageWarning("video", "*.mov", {"num": 1, "example": "side.mov"}),
+    ]
 
 
 def test_photograph_that_is_a_link_in_a_circle_keeps_no_other_one_back(
@@ -268,11 +269,9 @@ def test_linked_folders_are_followed_and_each_folder_is_taken_once(
         "linked/deep/d.png",
         "side/b.png",
     ]
-    (note,) = left_out(photos).items()
-    assert "0 side again/" in note[0]
-    assert note[1].startswith(
-        "left out: a link to a folder that is looked through anyway"
-    )
+    (warning,) = left_out(photos)
+    assert warning.code == "folder_linked_twice"
+    assert "0 side again/" in warning.about
 
 
 def test_folders_of_systems_are_left_out_and_named(tmp_path: Path) -> None:
@@ -284,9 +283,22 @@ def test_folders_of_systems_are_left_out_and_named(tmp_path: Path) -> None:
     )
     touch(tmp_path, "#recycle/old.jpg")
     assert list_images(tmp_path) == ["a.jpg"]
+    found = {warning.about: warning.code for warning in left_out(tmp_path)}
+    assert found == {"@eaDir/, in/@eaDir/": "thumbnails", "#recycle/": "deleted_folder"}
+
+
+def test_names_that_lists_cannot_hold_are_told_apart_and_none_is_lost(
+    tmp_path: Path,
+) -> None:
+    touch(tmp_path, "a.png", "b\nc.png", os.fsdecode(b"\xfe.png"))
     found = left_out(tmp_path)
-    assert found["@eaDir/, in/@eaDir/"].startswith("left out: thumbnails that a NAS")
-    assert found["#recycle/"] == "left out: what was deleted, or was there before"
+    codes = {warning.code: warning.values["example"] for warning in found}
+    assert codes == {
+        "control_character": "b\\u000ac.png",
+        "name_not_utf_8": "\\udcfe.png",
+    }
+    (text,) = texts_by_subject(found).values()
+    assert text == f"{found[0].text()}; {found[1].text()}"
 
 
 def write_transparent(path: Path, mask: Mask, mode: str = "RGBA") -> None:

@@ -114,3 +114,27 @@ def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:
     both = sum(image_region(item, (240, 160)) for item in split.items)
     assert_allclose(image_region(whole.items[0], (240, 160)), both)
     assert whole.rectified_area_px > 2 * split.rectified_area_px
+
+
+def test_regions_of_a_hundredth_of_the_image_and_their_smallest_parts_are_left_out() -> (
+    None
+):
+    options = DenseShapesOptions(covered_frac=1.0)
+    labels = np.zeros((40, 60), int)
+    labels[5:11, 4:8] = 1  # 24 of 2,400 blocks
+    grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
+    assert plan_dense_shapes(grid, (240, 160), options).items == ()
+    labels[5:15, 4:14] = 1
+    labels[30, 45:47] = 1  # a part of two blocks
+    grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
+    (item,) = plan_dense_shapes(grid, (240, 160), options).items
+    assert item.region.shape == (40, 40)
+
+
+def test_parts_of_a_region_that_are_close_share_a_warp() -> None:
+    options = DenseShapesOptions(covered_frac=1.0)
+    for gap, num in ((3, 1), (12, 2)):
+        labels = np.zeros((40, 60), int)
+        labels[5:15, 4:14] = labels[5:15, 14 + gap : 24 + gap] = 1
+        grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
+        assert len(plan_dense_shapes(grid, (240, 160), options).items) == num

@@ -282,3 +282,28 @@ def test_segments_without_tilted_shapes_have_no_warps() -> None:
     assert plan_room(upright).items == ()
     assert plan_room(np.zeros((0, 4))) == RectificationPlan(ROOM.size)
     assert len(plan_room(upright, tilt_radius=1.4).items) >= 3
+
+
+def test_planes_and_regions_that_are_small_are_left_out() -> None:
+    """By default a plane has 15 per cent of the pixels, and a region of it 3 per cent."""
+    wall = slanted_wall([0.3, 0.1, -0.9])
+    other = slanted_wall([-0.8, 0.1, -0.6])
+    depth, _ = wall.depth((400, 300))
+    depth_of_other, _ = other.depth((400, 300))
+    depth[:, 360:] = depth_of_other[:, 360:]  # a tenth of the pixels
+    depth[:, 352:356] = np.nan
+    depth[:, 344:348] = np.nan  # four columns between are 1 per cent
+    (segment,) = planar_segments(wall.photograph(), depth, PlaneOptions())
+    assert segment.region.origin == (0, 0)
+    assert segment.region.mask.shape == (300, 344)
+    every = PlaneOptions(min_votes_frac=0.05, min_region_frac=0.005)
+    assert len(planar_segments(wall.photograph(), depth, every)) > 1
+
+
+def test_noise_of_large_depth_maps_does_not_hide_planes() -> None:
+    """They are shrunk first: windows of 5 x 5 px would see the noise alone."""
+    wall = slanted_wall([0.3, 0.1, -0.9])
+    depth, _ = wall.depth((2000, 1500))
+    noise = np.random.default_rng(1).normal(1.0, 0.003, depth.shape)
+    (segment,) = planar_segments(wall.photograph(), depth * noise, PlaneOptions())
+    assert angles_deg(segment.normal, wall.normals[0]) < 3.0

@@ -15,10 +15,11 @@ from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import (
     ellipse_extents,
     fit_canvas,
+    lafs_from_keypoints,
     rectifying_affine,
 )
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
-from colmap_affrect.rectifiers.execute import extract_rectified
+from colmap_affrect.rectifiers.execute import extract_rectified, is_in_warp
 
 KEYPOINT_ERROR_PX = 0.1
 BIAS_PX = 0.05
@@ -154,3 +155,18 @@ def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_
     alone = extract_rectified(image, plan, PROFILE, 100_000, with_original=False)
     assert_allclose(alone.lafs, kept.lafs[kept.rectification_ids == 1])
     assert (alone.rectification_ids == 1).all()
+
+
+@pytest.mark.parametrize(("offset_sigmas", "is_same"), [(0.3, True), (1.0, False)])
+def test_a_feature_of_a_warp_is_the_same_within_half_a_sigma(
+    offset_sigmas: float, is_same: bool
+) -> None:
+    sigma_px = 2.0
+    radii = np.array([MEASUREMENT_SIGMAS * sigma_px])
+    angles = np.zeros(1)
+    found = []
+    for x in (50.0, 50.0 + offset_sigmas * sigma_px):
+        lafs = lafs_from_keypoints(np.array([[x, 40.0]]), radii, angles)
+        descriptors = np.zeros((1, 128), np.float32)
+        found.append(LocalFeatures(lafs, np.ones(1, np.float32), descriptors))
+    assert is_in_warp(*found).tolist() == [is_same]

@@ -20,9 +20,9 @@ TURN = turn(0, -8.0) @ turn(
 )  # columns are right, down and ahead of the building
 
 
-def pixels(points: Array) -> Array:
+def pixels(points: Array, rotation: Array = TURN) -> Array:
     """(N, 2) pixel-centre px of (N, 3) points in the frame of the building, its corner at 0."""
-    in_camera = points @ TURN.T + [0.0, 0.0, 6.0]
+    in_camera = points @ rotation.T + [0.0, 0.0, 6.0]
     return (
         FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:]
         + np.array(SIZE) / 2.0
@@ -30,7 +30,7 @@ def pixels(points: Array) -> Array:
     )
 
 
-def draw_wall(image: GrayImage, along: Array) -> None:
+def draw_wall(image: GrayImage, along: Array, rotation: Array = TURN) -> None:
     """Draw windows on a wall that runs from the corner along a direction."""
     down = np.array([0.0, 1.0, 0.0])
     for column in range(5):
@@ -38,7 +38,7 @@ def draw_wall(image: GrayImage, along: Array) -> None:
             start = along * (0.3 + 0.55 * column) + down * (0.6 * row - 1.2)
             corners = [start, start + 0.35 * along, start + 0.35 * along + 0.4 * down,
                        start + 0.4 * down]  # fmt: skip
-            outline = np.rint(pixels(np.array(corners))).astype(np.int32)
+            outline = np.rint(pixels(np.array(corners), rotation)).astype(np.int32)
             cv2.fillPoly(image, [outline], 40, cv2.LINE_AA)
 
 
@@ -90,3 +90,17 @@ def test_lines_by_chance_and_empty_pictures_give_no_warps() -> None:
     rectifier = RECTIFIERS.make(RECTIFIERS.options("lines"), RectifierInputs())
     assert not rectifier.plan(photograph_of(image)).items
     assert not rectifier.plan(photograph_of(np.full((90, 120), 128, np.uint8))).items
+
+
+def test_walls_at_twenty_degrees_from_the_front_are_left_as_they_are() -> None:
+    """A wall is warped from 30 degrees on, though a warp at less would be a bit better."""
+    nearly_ahead = turn(0, -4.0) @ turn(1, 20.0)
+    image = np.full(SIZE[::-1], 200, np.uint8)
+    draw_wall(image, np.array([1.0, 0.0, 0.0]), nearly_ahead)
+    draw_wall(image, np.array([-1.0, 0.0, 0.0]), nearly_ahead)
+    options = RECTIFIERS.options("lines")
+    assert (
+        not RECTIFIERS.make(options, RectifierInputs()).plan(photograph_of(image)).items
+    )
+    every = RECTIFIERS.options({"name": "lines", "min_angle_deg": 5.0})
+    assert RECTIFIERS.make(every, RectifierInputs()).plan(photograph_of(image)).items

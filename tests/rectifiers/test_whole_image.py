@@ -24,6 +24,7 @@ from colmap_affrect.rectifiers.affine_warps import (
     AffNetShapesOptions,
     Asift,
     AsiftOptions,
+    plan_whole_image,
 )
 from colmap_affrect.rectifiers.base import RectifierInputs
 
@@ -93,3 +94,18 @@ def test_affnet_shapes_warps_by_the_classes_that_are_there() -> None:
     )
     assert labels.tolist() == [0, 1, UNCOVERED_LABEL]
     assert len(classes) == 2
+
+
+def test_a_warp_of_the_whole_image_is_stretched_along_the_direction_of_its_class() -> (
+    None
+):
+    """An angle turns upwards from the right; y of pixels goes down."""
+    tilt = 3.0
+    angle = 0.6
+    centers = np.array([[tilt, angle]])
+    plan = plan_whole_image(SIZE, centers, AsiftOptions(area_preserving=False))
+    linear = plan.items[0].rectified_from_image[:2, :2]
+    along = np.array([np.cos(angle), -np.sin(angle)])
+    across = np.array([np.sin(angle), np.cos(angle)])
+    assert_allclose(linear @ along, [1.0, 0.0], atol=1e-12)
+    assert_allclose(linear @ across, [0.0, 1.0 / tilt], atol=1e-12)

@@ -44,7 +44,7 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "12 of 15 depths agree, scale +-3.1%",
         "1 camera, focal lengths: 1 from EXIF.", "one of them",
         "15 pairs are verified", "Pairs to look at", "is doubtful; guided", "60 inliers.",
-        "colmap-affrect show-pair OUT", "model: an &lt;old&gt; one",
+        "colmap-affrect show-pair OUT", "model: not rectified: an &lt;old&gt; one",
     ):  # fmt: skip
         assert text in html
     parts = [

@@ -240,7 +240,12 @@ def test_bad_images_are_named_and_the_others_registered(
     assert all(name in ended.errors[0] for name in failures)
     assert set(warnings) == {"*.webp", "*.gif", "contrast"}
     assert warnings["*.webp"].startswith("2 left out, such as side/y.WebP: ")
-    assert "colmap-affrect convert makes PNG" in warnings["*.gif"]
+    codes = {warning["about"]: warning["code"] for warning in extraction["warned"]}
+    assert codes == {
+        "*.webp": "format_unread",
+        "*.gif": "format_unread",
+        "contrast": "low_contrast",
+    }
 
 
 @pytest.mark.parametrize("suffix", IMAGE_SUFFIXES)

@@ -112,6 +112,6 @@ def test_camera_that_goes_round_a_box_loses_no_match(
     before = hdf5_content(workspace.matches)
     pairs = list(combinations(done.report["registered_names"], 2))
     assert (
-        StationaryFilter(FeatureStore(workspace.features), matches).learn(pairs) == ""
+        StationaryFilter(FeatureStore(workspace.features), matches).learn(pairs) == []
     )
     assert hdf5_content(workspace.matches) == before

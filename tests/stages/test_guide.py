@@ -179,3 +179,16 @@ def test_ids_of_a_pair_are_in_order(context: Context) -> None:
     guide(context, ALWAYS)
     with open_database(context.workspace.database) as database:
         assert len(database.read_two_view_geometries()[0]) == 6
+
+
+@pytest.mark.parametrize(("num_kept", "is_taken"), [(17, True), (12, False)])
+def test_geometry_that_loses_many_exact_inliers_is_not_taken_for_its_number_of_others(
+    num_kept: int, is_taken: bool
+) -> None:
+    exact = np.stack([np.arange(20)] * 2, axis=1)
+    model = Mock()
+    task = stage.GuidedTask((NAMES[0], NAMES[1]), model, exact, is_calibrated=False)
+    others = np.stack([np.arange(100, 140)] * 2, axis=1)
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = np.concatenate([exact[:num_kept], others])
+    assert stage.is_better(geometry, task) == is_taken

@@ -25,6 +25,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
@@ -95,8 +96,9 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
     workspace, report = extracted(tmp_path, photos, recipe)
     counts = FeatureStore(workspace.features).num_keypoints()
     assert (counts["faded.png"] > 0.9 * counts["good.png"]) == stretch
-    said = "is low in 1 of 2 photographs, such as faded.png; it was stretched"
-    assert [w.startswith(said) for w in report.warnings.values()] == [True] * stretch
+    values = {"num": 1, "example": "faded.png", "num_images": 2}
+    warning = StageWarning("low_contrast", "contrast", values)
+    assert report.warned == (warning,) * stretch
 
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
@@ -130,8 +132,9 @@ def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(
     workspace, report = extracted(tmp_path, photos, options, cameras=COURTYARD_CAMERA)
     assert report.failures == {}
     assert report.num_done == 2
-    assert list(report.warnings) == ["court_4.jpg"]
-    assert "not rectified" in report.warnings["court_4.jpg"]
+    (warning,) = report.warned
+    assert (warning.code, warning.about) == ("not_rectified", "court_4.jpg")
+    assert report.warnings == {"court_4.jpg": warning.text()}
     store = FeatureStore(workspace.features)
     assert (store.read("court_3.jpg").rectification_ids > 0).sum() > 50
     plain = prepare(load_recipe("unrectified-rootsift", DEPTH[1:]).extraction)

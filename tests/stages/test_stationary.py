@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 from colmap_affrect.stages.stationary import StationaryFilter
 
@@ -54,15 +55,36 @@ def scans(count: int) -> list[NDArray[np.float64]]:
     ]
 
 
+STANDS_STILL = StageWarning("camera_stands_still", "matches")
+
+
+def left_out(num_matches: int, num_pairs: int) -> StageWarning:
+    values = {"num_matches": num_matches, "num_pairs": num_pairs}
+    return StageWarning("stationary_matches", "matches", values)
+
+
 def test_caption_is_left_out_and_what_moves_stays(tmp_path: Path) -> None:
     features, matches, pairs = stores(tmp_path, scans(4))
-    line = StationaryFilter(features, matches).learn(pairs)
-    assert line.startswith(f"{6 * len(CAPTION)} matches of 6 pairs never move")
+    assert StationaryFilter(features, matches).learn(pairs) == [
+        left_out(6 * len(CAPTION), 6)
+    ]
     for found in matches.read(pairs):
         assert found.indices.tolist() == [[k, k] for k in range(len(SCENE))]
         assert found.scores[-1] == pytest.approx(0.1 + 0.8 * 199 / 239, abs=0.01)
         assert found.num_keypoints1 == len(SCENE) + len(CAPTION)
-    assert StationaryFilter(features, matches).learn(pairs) == ""
+    assert StationaryFilter(features, matches).learn(pairs) == []
+
+
+def test_captions_of_large_photographs_stand_still_though_they_are_some_pixels_off(
+    tmp_path: Path,
+) -> None:
+    """Features were found in photographs that had been shrunk."""
+    large = (4 * SIZE[0], 4 * SIZE[1])
+    points = [4.0 * scan for scan in scans(4)]
+    features, matches, pairs = stores(tmp_path, points, [large] * 4)
+    assert StationaryFilter(features, matches).learn(pairs) == [
+        left_out(6 * len(CAPTION), 6)
+    ]
 
 
 def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(
@@ -131,14 +153,15 @@ def test_call_that_was_killed_is_repeated_to_the_same_result(
         patch.setattr(MatchStore, "write", killed)
         with pytest.raises(KeyboardInterrupt):
             StationaryFilter(features, matches).learn(pairs)
-    line = StationaryFilter(features, matches).learn(pairs)
-    assert line.startswith(f"{2 * len(CAPTION)} matches of 2 pairs never move")
+    assert StationaryFilter(features, matches).learn(pairs) == [
+        left_out(2 * len(CAPTION), 2)
+    ]
     assert all(len(found.indices) == len(SCENE) for found in matches.read(pairs))
 
 
 def test_two_images_are_too_little_evidence(tmp_path: Path) -> None:
     features, matches, pairs = stores(tmp_path, scans(2))
-    assert StationaryFilter(features, matches).learn(pairs) == ""
+    assert StationaryFilter(features, matches).learn(pairs) == []
     assert all(len(found.indices) == 240 for found in matches.read(pairs))
 
 
@@ -162,7 +185,7 @@ def test_what_a_camera_turns_about_is_kept(tmp_path: Path, depth: float) -> None
     orbit = [turned(spread, degrees) for degrees in range(-25, 26, 10)]
     features, matches, pairs = stores(tmp_path, orbit)
     filtered = StationaryFilter(features, matches)
-    assert filtered.learn(pairs) == ""
+    assert filtered.learn(pairs) == []
     assert all(len(found.indices) == 1200 for found in matches.read(pairs))
 
 
@@ -185,8 +208,8 @@ def test_background_of_an_object_that_turns_before_a_still_camera_is_left_out(
 ) -> None:
     points, num = turntable(6)
     features, matches, pairs = stores(tmp_path, points)
-    line = StationaryFilter(features, matches).learn(pairs)
-    assert "or the background of something that turns?)" in line
+    (warning,) = StationaryFilter(features, matches).learn(pairs)
+    assert warning.code == "stationary_matches"
     for found in matches.read(pairs):
         of_object = found.indices[:, 0] < num
         assert np.count_nonzero(of_object) > 0.9 * num
@@ -256,13 +279,11 @@ def test_background_ties_photographs_from_elsewhere(tmp_path: Path) -> None:
             assert len(found.indices) == len(points[0])
 
 
-def test_where_nothing_else_moves_nothing_is_left_out_and_the_line_says_what_to_do(
+def test_where_nothing_else_moves_nothing_is_left_out_and_is_said(
     tmp_path: Path,
 ) -> None:
     features, matches, pairs = stores(tmp_path, [np.concatenate([SCENE, CAPTION])] * 6)
-    line = StationaryFilter(features, matches).learn(pairs)
-    assert "the camera stands still" in line
-    assert "--mask-path" in line
+    assert StationaryFilter(features, matches).learn(pairs) == [STANDS_STILL]
     assert all(len(found.indices) == 240 for found in matches.read(pairs))
 
 
@@ -273,7 +294,7 @@ def test_wrong_matches_of_a_still_camera_are_no_object_that_moves(
     anywhere = [random.uniform((720, 0), SIZE, (60, 2)) for _ in range(6)]
     points = [np.concatenate([SCENE, one]) for one in anywhere]
     features, matches, pairs = stores(tmp_path, points)
-    assert "the camera stands still" in StationaryFilter(features, matches).learn(pairs)
+    assert StationaryFilter(features, matches).learn(pairs) == [STANDS_STILL]
     assert all(len(found.indices) == 260 for found in matches.read(pairs))
 
 
@@ -319,10 +340,10 @@ def test_place_where_other_pairs_move_is_kept(tmp_path: Path) -> None:
         )  # four images agree there, three do not
         turned.append(np.concatenate([moved, CAPTION + 9.0 * k]))
     features, matches, pairs = stores(tmp_path, turned)
-    assert StationaryFilter(features, matches).learn(pairs) == ""
+    assert StationaryFilter(features, matches).learn(pairs) == []
 
 
 def test_photographs_of_other_sizes_are_left_alone(tmp_path: Path) -> None:
     sizes = [SIZE, (640, 960), (961, 640), (960, 641)]
     features, matches, pairs = stores(tmp_path, scans(4), sizes)
-    assert StationaryFilter(features, matches).learn(pairs) == ""
+    assert StationaryFilter(features, matches).learn(pairs) == []

@@ -1,0 +1,33 @@
+"""Warnings are codes with values, and every code has its sentence."""
+
+from __future__ import annotations
+
+from string import Formatter
+from typing import get_args
+
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_warnings import (
+    SENTENCES,
+    StageWarning,
+    WarningCode,
+)
+
+
+def test_every_warning_can_be_said() -> None:
+    assert set(SENTENCES) == set(get_args(WarningCode))
+    for code, sentence in SENTENCES.items():
+        names = [name for _, name, *_ in Formatter().parse(sentence) if name]
+        warning = StageWarning(code, "it", dict.fromkeys(names, "x"))
+        assert warning.line() == f"it: {warning.text()}"
+        assert "{" not in warning.text()
+
+
+def test_report_has_warnings_as_texts_and_as_codes_with_their_values() -> None:
+    warning = StageWarning("pages", "a.tif", {"num_pages": 3})
+    report = StageReport("extract", 1.0, 2, warned=(warning,))
+    content = report.to_mapping()
+    assert content["warnings"] == {"a.tif": warning.text()}
+    assert content["warned"] == [
+        {"code": "pages", "about": "a.tif", "text": warning.text(), "num_pages": 3}
+    ]
+    assert "1 with a warning" in report.summary()
