@@ -312,6 +312,8 @@ def _no_surer_than_ties(
         mapped: The model.
         task: What it was made from.
     """
+    if not mapped.bridges:
+        return dict(confidences)
     graph = graph_of(task, MIN_NUM_MATCHES)
     poses = poses_of(mapped.reconstruction)
     cameras = cameras_of(mapped.reconstruction)
