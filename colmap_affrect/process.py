@@ -6,6 +6,7 @@ or lose it; later where the child does not end within four seconds, as in native
 returns. When native code has crashed it says so in one line. Nothing heavy is imported here.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -197,6 +198,9 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     code: int | str | None
 
     def begin() -> None:
+        # What has been loaded stays: nothing of it is to be looked for garbage.
+        gc.freeze()
+        gc.enable()
         if tell_begin:
             tell_begin()
         _handle(interrupts.raise_first)
@@ -206,6 +210,7 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     try:
         if not tell_begin:
             _handle(_leave)
+        gc.disable()  # while packages are loaded, which is a tenth faster so
         from colmap_affrect.cli import main
 
         code = main(begin=begin)

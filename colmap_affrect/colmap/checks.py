@@ -102,7 +102,8 @@ def refuse_unusable(
     Raises:
         DatabaseError: names the first of these problems, and what to do about it.
     """
-    _, problems = check_database(path)
+    looks_for_moved = warns or "keypoints-moved" in kinds
+    _, problems = check_database(path, looks_for_moved=looks_for_moved)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         what = CHECKS[kind]["what"]
         advice = CHECKS[kind]["advice"].format(path=path)
@@ -115,8 +116,13 @@ def refuse_unusable(
         logger.warning("%s: %s (%s); %s", path, check["what"], items, check["advice"])
 
 
-def check_database(path: Path) -> tuple[Tables, Problems]:
-    """Check a database, which is only read; DatabaseError if damaged."""
+def check_database(
+    path: Path, *, looks_for_moved: bool = True
+) -> tuple[Tables, Problems]:
+    """Check a database, which is only read; DatabaseError if damaged.
+
+    Whether keypoints have moved after verification, which takes longest, is left out on request.
+    """
     found: Problems = defaultdict(list)
     with open_read_only(path) as connection:
         try:
@@ -130,7 +136,9 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             _check_keypoints(connection, tables, found)
             _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
-            if FATAL.isdisjoint(found):  # else there may be no such rows
+            if looks_for_moved and FATAL.isdisjoint(
+                found
+            ):  # else there may be no such rows
                 moved = images_with_moved_keypoints(connection, tables)
                 found.update({"keypoints-moved": moved} if moved else {})
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:

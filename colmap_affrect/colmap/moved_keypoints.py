@@ -120,6 +120,8 @@ def _fitting_share(
 ) -> float | None:
     """Return the share of matches that fit one of the geometries of their pair, the largest one.
 
+    Once most fit the first one, the others are not looked at.
+
     Args:
         images: Of the database.
         ids: Of both images.
@@ -135,16 +137,25 @@ def _fitting_share(
     longer_side = max(image.longer_side for image in both)
     limit_px = max(MAX_ERROR_PX, MAX_ERROR * longer_side)
     fundamental, essential, homography = map(_matrix, blobs)
-    errors = list[Array]()
+    share: float | None = None
     with np.errstate(all="ignore"):  # errors that are not numbers fit nothing
         if fundamental is not None:
-            errors.append(sampson_errors(fundamental, points1, points2))
+            share = _share_within(
+                limit_px, sampson_errors(fundamental, points1, points2)
+            )
+            if share >= MIN_FITTING:
+                return share
         if essential is not None:
-            errors += _errors_of_rays(essential, both, (points1, points2))
+            for errors in _errors_of_rays(essential, both, (points1, points2)):
+                share = max(share or 0.0, _share_within(limit_px, errors))
         if homography is not None:
-            errors.append(homography_errors(homography, points1, points2))
-    shares = [float((of_one <= limit_px).mean()) for of_one in errors]
-    return max(shares, default=None)
+            errors = homography_errors(homography, points1, points2)
+            share = max(share or 0.0, _share_within(limit_px, errors))
+    return share
+
+
+def _share_within(limit_px: float, errors: Array) -> float:
+    return float(np.count_nonzero(errors <= limit_px) / len(errors))
 
 
 def _errors_of_rays(

@@ -18,6 +18,7 @@ FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 rotation is a shift of the image; theory."""
 # Measure a ratio to two per cent (theory: binomial standard deviation)
 MAX_NUM_POINTS = 500
+TINY = 1e-12  # lengths are divided by; numeric
 # Of a rotated ray of length 1; what is behind lands far outside of the image; numeric
 MIN_DEPTH = 1e-3
 # Rotations of two matches each; least squares begin with the best one; resource
@@ -108,15 +109,23 @@ def _rotation_ratios(
     columns1 = np.ascontiguousarray(np.swapaxes(rays1, -1, -2))
     random = np.random.default_rng(0)
     samples = random.integers(len(points1), size=(NUM_STARTS, 2))
-    starts = _fitted_rotations(rays1[:, samples], rays2[:, samples])
+    starts = _rotations_of_two(rays1[:, samples], rays2[:, samples])
     errors = np.empty(rays1.shape[:2])
+    # To compare starts half the digits do, in half the time.
+    columns1_32 = columns1.astype(np.float32)
+    points2_32 = points2.astype(np.float32)
+    starts_32 = starts.astype(np.float32)
     # Lens by lens: what stays in the cache of a core is four times as fast.
     for index, focal2 in enumerate(focals2):
-        start_errors = _rotation_errors(starts[index], columns1[index], points2, focal2)
-        best_start = np.median(start_errors, axis=1).argmin()
-        errors[index] = start_errors[best_start]
+        start_errors = _rotation_errors(
+            starts_32[index], columns1_32[index], points2_32, float(focal2)
+        )
+        best_start = _medians(start_errors).argmin()
+        errors[index] = _rotation_errors(
+            starts[index, best_start, None], columns1[index], points2, float(focal2)
+        )[0]
     for _ in range(MAX_ITERATIONS):
-        limits = np.maximum(error, np.median(errors, axis=1))
+        limits = np.maximum(error, _medians(errors))
         is_inlier = errors <= limits[:, None]
         rotations = _fitted_rotations(rays1 * is_inlier[..., None], rays2)
         for index, focal2 in enumerate(focals2):
@@ -127,8 +136,8 @@ def _rotation_ratios(
 
 
 def _rotation_errors(
-    rotations: Array, columns1: Array, points2: Array, focal2: float
-) -> Array:
+    rotations: Floats, columns1: Floats, points2: Floats, focal2: float
+) -> Floats:
     """Return (S, N) px between rotated rays and their matches, for one lens.
 
     Args:
@@ -143,6 +152,39 @@ def _rotation_errors(
     errors_x = rotated[:, 0] * scales - points2[:, 0]
     errors_y = rotated[:, 1] * scales - points2[:, 1]
     return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
+
+
+def _rotations_of_two(rays1: Array, rays2: Array) -> Array:
+    """Return the (..., 3, 3) rotations that map (..., 2, 3) unit rays best to others.
+
+    They map the middle of two rays, and their difference, which are at right angles: what Kabsch's
+    method finds too, in a fifth of the time.
+    """
+    return np.asarray(np.swapaxes(_axes_of_two(rays2), -1, -2) @ _axes_of_two(rays1))
+
+
+def _axes_of_two(rays: Array) -> Array:
+    """Return (..., 3, 3) rows: unit vectors along the sum, the difference and the normal."""
+    axes = np.empty((*rays.shape[:-2], 3, 3))
+    axes[..., 0, :] = rays[..., 0, :] + rays[..., 1, :]
+    axes[..., 1, :] = rays[..., 0, :] - rays[..., 1, :]
+    lengths = np.linalg.norm(axes[..., :2, :], axis=-1, keepdims=True)
+    axes[..., :2, :] /= np.maximum(lengths, TINY)
+    x1, y1, z1 = np.moveaxis(axes[..., 0, :], -1, 0)
+    x2, y2, z2 = np.moveaxis(axes[..., 1, :], -1, 0)
+    axes[..., 2, 0] = y1 * z2 - z1 * y2
+    axes[..., 2, 1] = z1 * x2 - x1 * z2
+    axes[..., 2, 2] = x1 * y2 - y1 * x2
+    return axes
+
+
+def _medians(rows: Floats) -> Floats:
+    """Return the medians of rows: ``np.median`` takes half as long again."""
+    middle = rows.shape[1] // 2
+    if rows.shape[1] % 2:
+        return np.asarray(np.partition(rows, middle, axis=1)[:, middle])
+    parted = np.partition(rows, (middle - 1, middle), axis=1)
+    return np.asarray(parted[:, middle - 1 : middle + 1].mean(axis=1))
 
 
 def _fitted_rotations(rays1: Array, rays2: Array) -> Array:

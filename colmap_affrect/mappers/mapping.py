@@ -316,6 +316,8 @@ def _no_surer_than_ties(
         mapped: The model.
         task: What it was made from.
     """
+    if not mapped.bridges:
+        return dict(confidences)
     partners = _agreeing_partners(mapped, task)
     left = sorted(mapped.bridges.keys() & confidences.keys())
     found = {name: one for name, one in confidences.items() if name not in left}

@@ -1,7 +1,8 @@
 """Files of matches of other programs: those of hloc and deep-image-matching, and COLMAP's lists.
 
 - hloc: a group for each pair with ``matches0`` (N0,), -1 where unmatched. In its key each '/' of a
-  name is '-', and '/' stands between the names; older files have '_' there.
+  name is '-', and '/' stands between the names; older files have '_' there. A run's own
+  ``matches.h5`` is such a file.
 - deep-image-matching, and notebooks of the image matching challenge: a group for the first image,
   in it for the second one the (M, 2) matches.
 - COLMAP's text lists, as ``matches_importer`` takes them: a line of two names, a line of two
@@ -27,6 +28,7 @@ MatchType = Literal["raw", "inliers"]
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 HLOC = "matches0"
+OWN_FORMAT = "colmap_affrect/matches"  # attribute of a run's matches.h5
 COMPLETE = "write it anew with the program that made it"
 
 
@@ -76,13 +78,30 @@ def _of_hdf5(source: GivenFile, names: Collection[str]) -> GivenMatches:
             if key in source.shapes:
                 yield pair, source.read(key, (None, 2), "iu").astype(np.int64)
                 continue
-            column = source.read(
-                f"{key}/{HLOC}", (num_features[pair[0]],), "iu"
-            ).astype(np.int64)
+            column = _column(source, f"{key}/{HLOC}", num_features[pair[0]])
             rows = np.flatnonzero(column != -1)
             yield pair, np.stack([rows, column[rows]], axis=1)
 
     return GivenMatches(path=source.path, pairs=tuple(keys), read=read)
+
+
+def _column(source: GivenFile, key: str, num_features: int) -> Indices:
+    """Return the match of each feature of a first image, -1 where it has none.
+
+    In a file of ours there may be fewer than features: what escalation has added
+    to the image since then follows those that there were.
+
+    Args:
+        source: the file.
+        key: of the dataset.
+        num_features: of the first image.
+    """
+    expected: int | None = num_features
+    is_own = source.file.attrs.get("format") == OWN_FORMAT
+    shape = source.shapes[key]
+    if is_own and len(shape) == 1 and shape[0] <= num_features:
+        expected = None
+    return source.read(key, (expected,), "iu").astype(np.int64)
 
 
 def _once(found: Iterator[tuple[Pair, str]]) -> dict[Pair, str]:

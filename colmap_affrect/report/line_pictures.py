@@ -127,7 +127,7 @@ def report_lines(
             gray = read_gray(path)
         except ImageError as error:
             logger.warning("%s", error)
-            found.failures[str(path)] = str(error)
+            found.failures[str(path)] = str(error).removeprefix(f"{path}: ")
             continue
         lines = lines_of(gray)
         report = line_report(lines, (gray.shape[1], gray.shape[0]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from colmap_affrect.geometry import parallax
 from colmap_affrect.geometry.affine import project, rotation
 from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.geometry.parallax import (
@@ -131,3 +132,19 @@ def test_mirrored_copies_of_dense_keypoints_prove_little() -> None:
     mirrored = points * [-1.0, 1.0] + [side, 0.0]
     share = mirrored_share(points, mirrored, ((side, side), (side, side)))
     assert 0.15 < share < 0.6
+
+
+def test_the_rotation_of_two_rays_is_that_of_kabsch() -> None:
+    random = np.random.default_rng(0)
+    rays1 = random.normal(size=(40, 2, 3))
+    rays2 = random.normal(size=(40, 2, 3))
+    rays1 /= np.linalg.norm(rays1, axis=-1, keepdims=True)
+    rays2 /= np.linalg.norm(rays2, axis=-1, keepdims=True)
+    found = parallax._rotations_of_two(rays1, rays2)
+    assert_allclose(found, parallax._fitted_rotations(rays1, rays2), atol=1e-9)
+
+
+def test_medians_are_those_of_numpy() -> None:
+    rows = np.random.default_rng(0).normal(size=(5, 8))
+    assert_allclose(parallax._medians(rows), np.median(rows, axis=1))
+    assert_allclose(parallax._medians(rows[:, 1:]), np.median(rows[:, 1:], axis=1))

@@ -17,6 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.interop.hdf5 import import_h5
+from colmap_affrect.project.stores import MatchStore
 
 PAIR = ("a.png", "sub/b c.png")
 
@@ -40,6 +41,19 @@ def test_pair_names_of_older_hloc_are_read(
     ((pair, indices),) = files.pairs().items()
     assert sorted(indices) == expected
     assert pair in (PAIR, ("sub/b c.png", "sub_x/d.png"))
+
+
+def test_features_that_escalation_of_a_run_has_added_follow_those_of_its_matches(
+    files: Files,
+) -> None:
+    write_h5(files.matches, {"sub-b c.png/a.png": match_group([2, -1])})
+    with pytest.raises(StoreError, match="matches0 has shape"):
+        files.import_all()
+    with h5py.File(files.matches, "a") as file:
+        file.attrs["format"] = MatchStore.format
+    assert files.import_all().num_pairs == 1
+    ((_, indices),) = files.pairs().items()
+    assert sorted(indices) == [[2, 0]]
 
 
 def test_older_pair_name_that_stands_for_two_pairs_is_refused(tmp_path: Path) -> None:

@@ -15,11 +15,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_tracks
-from colmap_affrect.mappers import reliability_features
+from colmap_affrect.mappers import focal_observability, reliability_features
 from colmap_affrect.mappers.adjustment import EarlyStop
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import (
     MAX_NUM_OBSERVATIONS,
+    focal_growths,
     with_fewer_points,
 )
 from colmap_affrect.mappers.mapping import map_database
@@ -164,6 +165,22 @@ def test_trials_have_few_observations_of_a_rig_and_all_others_of_single_cameras(
     assert num_all == single.compute_num_observations() > 2 * MAX_NUM_OBSERVATIONS
     assert with_fewer_points(single).compute_num_observations() == num_all
     assert 0 < with_fewer_points(rig).compute_num_observations() <= MAX_NUM_OBSERVATIONS
+
+
+def test_few_observations_of_a_rig_tell_its_focal_lengths_nearly_as_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.db"
+    model = synthesize_rig(path)
+    noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5)
+    pycolmap.synthesize_noise(noise, model)
+    task = MappingTask(path, None, cameras=unknown_cameras(path))
+    few = focal_growths(model, task)
+    monkeypatch.setattr(focal_observability, "NUM_OBSERVATIONS_PER_IMAGE", 10_000)
+    of_all = focal_growths(model, task)
+    assert len(few) == 3
+    for camera_id, growth in of_all.items():
+        assert 0.5 * growth < few[camera_id] < 2.0 * growth
 
 
 def test_what_is_not_to_be_refined_stays_as_the_database_has_it(tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_what_cannot_be_read_is_passed_over_and_nothing_is_overwritten(
     found = report_lines([bad, good, blank, good], tmp_path / "out")
     assert list(found.photographs) == [str(good), str(blank)]
     assert list(found.failures) == [str(bad)]
+    assert str(bad) not in found.failures[str(bad)]  # the summary names it before
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "a.png-lines.png",
         "b.png-lines.png",
