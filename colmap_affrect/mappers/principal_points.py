@@ -19,12 +19,13 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.mappers.adjustment import FINAL, MEDIUM
+from colmap_affrect.mappers.adjustment import MEDIUM
 from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
     has_free_center,
     shifted_principal_point,
 )
+from colmap_affrect.mappers.distortion import straighten
 from colmap_affrect.mappers.focal_observability import with_fewer_points
 from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
@@ -93,8 +94,8 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
     num_observations = with_fewer_points(model).compute_num_observations()
     if not num_observations:
         return False
-    held_cost = _lowest_cost(model, held)
-    free_cost = _lowest_cost(model, free)
+    held_cost = min(held.costs_of_starts(model))
+    free_cost = min(free.costs_of_starts(model))
     num_freed = 0
     for key in used_cameras(model):
         prior = free.adjuster.priors[key]
@@ -102,17 +103,6 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
             num_freed += 1
     per_parameter = 0.5 * math.log(num_observations)
     return held_cost - free_cost > 2 * num_freed * per_parameter
-
-
-def _lowest_cost(model: pycolmap.Reconstruction, search: Search) -> float:
-    """Return the lower cost of a model that is adjusted as it is, and from a straight lens."""
-    as_it_is = with_fewer_points(model)
-    straightened = with_fewer_points(model)
-    _straighten(straightened, search)
-    costs = []
-    for start in (as_it_is, straightened):
-        costs.append(search.adjuster.adjust(start, FINAL))
-    return min(costs)
 
 
 def with_shifted_axes(
@@ -126,7 +116,7 @@ def with_shifted_axes(
         graph: Pairs that the model is made from.
     """
     changed = pycolmap.Reconstruction(model)
-    _straighten(changed, free)
+    straighten(changed, free.adjuster.priors)
     straight = dict[int, CameraPrior]()
     for key, prior in free.adjuster.priors.items():
         straight[key] = replace(
@@ -187,14 +177,6 @@ def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> floa
         if prior:
             total += prior.cost(camera.principal_point_x, camera.principal_point_y)
     return total
-
-
-def _straighten(model: pycolmap.Reconstruction, search: Search) -> None:
-    """Take the distortion of unknown cameras away, in place."""
-    for camera in used_cameras(model).values():
-        if search.adjuster.priors[camera.camera_id].is_unknown:
-            for index in camera.extra_params_idxs():
-                camera.params[index] = 0.0
 
 
 def _coarser(search: Search, factor: float) -> Search:
