@@ -84,9 +84,9 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
     The cost with free ones must be lower by more than free parameters are worth (BIC: Schwarz,
     Estimating the dimension of a model, 1978), half the logarithm of the number of observations
     each. These are one of each view camera, which shifts up and down, or two of each crop. Of
-    made-up prints the cost is lower by 34 to 680, which is 1.1 to 16 times what is needed, of whole
-    photographs by 2 to 17, half of it. A lens that distortion has trapped is no sign: all also
-    begin with a straight one.
+    made-up prints the cost is lower by 34 to 680, just as much as is needed or up to 16 times that,
+    of whole photographs by 2 to 17, at most half of it. A lens that distortion has trapped is no
+    sign: all also begin with a straight one.
 
     Args:
         model: With held principal points; it stays as it is.
@@ -116,7 +116,7 @@ def _only_up_and_down(free: Search, freed: Set[int]) -> Search:
 
     Args:
         free: The search with free principal points.
-        freed: Ids of the cameras, of which the images of each are those of a view camera.
+        freed: Ids of the cameras that are taken for view cameras.
     """
     priors = dict(free.adjuster.priors)
     for camera in free.graph.cameras.values():
