@@ -1,5 +1,7 @@
-"""Progress of long stages: a tqdm bar, lines or silence; and when the first model will be there."""
+"""Progress of long stages: a tqdm bar, lines or silence; and how long a whole run still takes."""
 
+import math
+import os
 import subprocess
 import sys
 import threading
@@ -18,8 +20,19 @@ NUM_PLAIN_LINES = 10  # display
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
-# Of a stage: before, it has loaded files and networks, and says too little; display
+AFTER_FIRST_MODEL = ("escalate", "learned", "pictures")
+"""How the names of the stages begin that follow the first model."""
+AFTER_SHARE = 0.6
+"""Of the time until the first model, what follows it: nothing where it is sure of all, up to twice
+as much; measured on sets of 4 to 7 photographs, good for a factor of 2."""
+GOES_ON_SHARE = 0.5
+"""Of the time that mapping has taken already: what it still takes, at least, since hypotheses
+follow the last photograph; measured on the same sets."""
+LIKELY_SHARE = 0.5  # of the time that all steps may take at most: most help; measured
+# Of a run: before, it has loaded files and networks, and says too little; display
 MIN_ELAPSED_S = 3.0
+MIN_NUM_MEASURED = 2  # units after the first ones that tell how fast a stage is; judged
+LONGEST_IN_SECONDS = 90.0  # that a forecast tells in seconds; display
 
 
 # Of silence, until something says that the work goes on (display); where lines stay, as in a log,
@@ -65,7 +78,7 @@ class Voice:
 
 
 class Forecast:
-    """What is left of a row of stages: the one that runs is measured, others guessed from it."""
+    """What is left of a whole run: measured where it has begun, learned from there for the rest."""
 
     def __init__(
         self,
@@ -73,19 +86,31 @@ class Forecast:
         num_pairs: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take what is ahead if all images are new."""
-        # Of the stages that are ahead
-        self._costs = {
+        """Take what is ahead if all images are new.
+
+        Args:
+            num_images: photographs of the run.
+            num_pairs: pairs that will be matched.
+            clock: seconds from anywhere on.
+        """
+        self._ahead = {
             "extract": COSTS["extract"] * num_images,
             "match": COSTS["match"] * num_pairs,
             "verify": COSTS["verify"] * num_pairs,
             # Adjustments grow with the model.
             "map": COSTS["map"] * (num_images + num_images**2 // 50),
         }
-        # Of the stage that runs
-        self._cost = 0.0
-        self._start_s = 0.0
+        """Costs of the stages until the first model that have not begun."""
         self._clock = clock
+        self._run_began_s = clock()
+        self._work_began_s = clock()  # files and networks are loaded before
+        self._stage = _RunningStage(0.0, 0, clock())
+        self._name = ""  # of the stage
+        self._is_first_model = True  # that is being made
+        self._done_cost = 0.0  # of the stages that have a cost and have ended
+        self._done_s = 0.0  # that they took
+        self._limit_s = 0.0  # of all that may follow the first model
+        self._limit_told_s = clock()
 
     def begin(self, name: str, total: int) -> None:
         """Take note that a stage begins.
@@ -94,25 +119,122 @@ class Forecast:
             name: of the stage.
             total: images or pairs that it will work on.
         """
-        is_known = self._costs.pop(name, None) is not None
-        self._cost = is_known * COSTS.get(name, 0.0) * total
-        self._start_s = self._clock()
+        self._end_stage()
+        self._name = name
+        if name == "extract":
+            self._work_began_s = self._clock()
+        known = self._ahead.pop(name, 0.0)
+        kind = name.partition(",")[0]  # "match, all features" costs what "match" does
+        unit_cost = COSTS.get(kind, 0.0)
+        if name == "map":
+            unit_cost = known / max(total, 1)
+        self._stage = _RunningStage(unit_cost * total, total, self._clock())
+        is_after = name.startswith(AFTER_FIRST_MODEL)
+        if is_after and self._is_first_model:
+            self._is_first_model = False
+            self._ahead.clear()
 
-    def text(self, frac: float) -> str:
-        """Say how long the first model takes, when a fraction of the stage is done.
+    def advance(self, num_done: int) -> None:
+        """Take note of how many units of the stage are done."""
+        self._stage.advance(num_done, self._clock())
 
-        Empty while too little is measured, in the last minute, and from mapping on.
+    def expect(self, seconds: float) -> None:
+        """Take note of how long all that follows may take at most, where nothing helps."""
+        self._limit_s = seconds
+        self._limit_told_s = self._clock()
+
+    def left_s(self) -> float | None:
+        """Return the seconds that are left of the run; None while too little is measured."""
+        now_s = self._clock()
+        here_s = self._stage.left_s(now_s)
+        if here_s is None or now_s - self._run_began_s < MIN_ELAPSED_S:
+            return None
+        if self._name == "map":
+            here_s = max(here_s, self._left_of_map_s(now_s))
+        if not self._is_first_model:
+            passed_s = now_s - self._limit_told_s
+            return max(here_s, LIKELY_SHARE * self._limit_s - passed_s)
+        left_s = here_s + self._pace(now_s) * sum(self._ahead.values())
+        first_model_s = now_s - self._work_began_s + left_s
+        return left_s + AFTER_SHARE * first_model_s
+
+    def _left_of_map_s(self, now_s: float) -> float:
+        """Return how long mapping takes by what it costs, and by what it has taken."""
+        elapsed_s = now_s - self._stage.began_s
+        pace = self._done_s / self._done_cost if self._done_cost else 0.0
+        return max(pace * self._stage.cost - elapsed_s, GOES_ON_SHARE * elapsed_s)
+
+    def text(self) -> str:
+        """Say how long the run still takes; empty while too little is measured."""
+        left_s = self.left_s()
+        return "" if left_s is None else f"about {_duration(left_s)} left in all"
+
+    def _pace(self, now_s: float) -> float:
+        """Return the seconds of a unit of cost, measured in this stage and those before."""
+        cost = self._done_cost + self._stage.done_cost
+        seconds = self._done_s
+        if self._stage.cost:
+            seconds += now_s - self._stage.began_s
+        return seconds / cost if cost else 0.0
+
+    def _end_stage(self) -> None:
+        """Learn from the stage that has ended."""
+        if self._stage.done_cost:
+            self._done_cost += self._stage.done_cost
+            self._done_s += self._clock() - self._stage.began_s
+
+
+class _RunningStage:
+    """A stage that runs, and how fast."""
+
+    def __init__(self, cost: float, total: int, began_s: float) -> None:
+        self.cost = cost  # of all its units; 0 where it is not known
+        self.total = total
+        self.began_s = began_s
+        self._num_done = 0
+        self._first_s = began_s  # when its first units were done
+        self._num_first = 0
+
+    @property
+    def done_cost(self) -> float:
+        """Of the units that are done, and of half of those that cores work on."""
+        num = self._num_done + self._num_begun
+        return self.cost * num / self.total if self._num_done else 0.0
+
+    @property
+    def _num_begun(self) -> float:
+        """Units that cores work on, each as half of one."""
+        return min(os.cpu_count() or 1, self.total - self._num_done) / 2
+
+    def advance(self, num_done: int, now_s: float) -> None:
+        """Take note of how many units are done."""
+        if not self._num_done:
+            self._first_s = now_s
+            self._num_first = num_done
+        self._num_done = num_done
+
+    def left_s(self, now_s: float) -> float | None:
+        """Return how long the other units take; None while none is done.
+
+        The first units wait for files and networks that are loaded, and do not count once there
+        are more. Before, what cores work on meanwhile counts as half done.
         """
-        elapsed_s = self._clock() - self._start_s
-        if not (frac and self._cost and self._costs) or elapsed_s < MIN_ELAPSED_S:
-            return ""
-        # In units of this stage
-        remaining = (1 - frac) + sum(self._costs.values()) / self._cost
-        minutes = elapsed_s / frac * remaining / 60
-        if minutes < 1:
-            return ""
-        about = f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
-        return f"first model in about {about}"
+        if not self._num_done:
+            return None
+        num_left = self.total - self._num_done
+        num_measured = self._num_done - self._num_first
+        if num_measured >= MIN_NUM_MEASURED:
+            return (now_s - self._first_s) / num_measured * num_left
+        pace = (now_s - self.began_s) / (self._num_done + self._num_begun)
+        return pace * (num_left - self._num_begun)
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration in few words, as exactly as a forecast is."""
+    if seconds < LONGEST_IN_SECONDS:
+        return f"{max(math.ceil(seconds / 10), 1) * 10} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 @dataclass(eq=False)
@@ -123,7 +245,7 @@ class Progress:
         stream: where it is written to, as ``sys.stderr``; None is silence.
         num_plain_lines: most lines of a stage, where the stream takes no bars.
         title: with which the names of stages begin.
-        forecast: says how long all stages take.
+        forecast: says how long all stages still take.
         voice: knows when something was shown last.
     """
 
@@ -194,11 +316,16 @@ class Progress:
         bar = tqdm(total=total, desc=title, unit=unit, file=self.stream)
 
         def advance(count: int) -> None:
-            text = self._remaining_text(bar.n + count, total)
-            bar.set_postfix_str(text, refresh=False)
+            if self.forecast:
+                self.forecast.advance(bar.n + count)
+            show_forecast()
             bar.update(count)
 
-        with bar, _refresh_each_second(bar, self.voice, title):
+        def show_forecast() -> None:
+            text = self.forecast.text() if self.forecast else ""
+            bar.set_postfix_str(text, refresh=False)
+
+        with bar, _refresh_each_second(bar, self.voice, title, show_forecast):
             yield advance
 
     def _lines(self, name: str, total: int, unit: str) -> Iterator[Advance]:
@@ -215,7 +342,7 @@ class Progress:
         def advance(count: int) -> None:
             nonlocal num_done, num_lines
             num_done += count
-            text = self._remaining_text(num_done, total)
+            text = self._remaining_text(num_done)
             num_wanted = num_done * self.num_plain_lines // total
             if num_wanted > num_lines:
                 num_lines = num_wanted
@@ -225,9 +352,17 @@ class Progress:
         if not num_lines:
             print_line("")
 
-    def _remaining_text(self, num_done: int, total: int) -> str:
-        """Say how long the first model takes, where that is known."""
-        return self.forecast.text(num_done / total) if self.forecast else ""
+    def expect(self, seconds: float) -> None:
+        """Tell the forecast how long all that follows may take at most."""
+        if self.forecast:
+            self.forecast.expect(seconds)
+
+    def _remaining_text(self, num_done: int) -> str:
+        """Say how long the run still takes, where that is known."""
+        if not self.forecast:
+            return ""
+        self.forecast.advance(num_done)
+        return self.forecast.text()
 
     @contextmanager
     def never_silent(self, interval_s: float = 1.0) -> Iterator[None]:
@@ -261,13 +396,16 @@ class Progress:
 
 
 @contextmanager
-def _refresh_each_second(bar: tqdm, voice: Voice, title: str) -> Iterator[None]:
+def _refresh_each_second(
+    bar: tqdm, voice: Voice, title: str, update: Callable[[], None]
+) -> Iterator[None]:
     """Show each second how long a bar has run: one unit may take a minute."""
     is_over = threading.Event()
     voice.heard(title)
 
     def tick() -> None:
         while not is_over.wait(1.0):
+            update()
             bar.refresh()
             voice.heard(title)
 

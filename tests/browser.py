@@ -43,7 +43,10 @@ class Browser:
         self._address = address
 
     def open(self, page: Path) -> None:
-        _call(f"{self._address}/url", url=page.resolve().as_uri())
+        self.visit(page.resolve().as_uri())
+
+    def visit(self, address: str) -> None:
+        _call(f"{self._address}/url", url=address)
 
     def run(self, script: str, *arguments: Any) -> Any:
         """Run a function body in the page and return what it returns."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+import re
 import threading
 from collections.abc import Callable
 
 import pytest
 
 from colmap_affrect.progress import (
+    AFTER_SHARE,
     COSTS,
+    GOES_ON_SHARE,
     NUM_PLAIN_LINES,
     SILENT,
     Forecast,
@@ -41,23 +44,109 @@ def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent
     assert (lines[0], lines[-1]) == ("match: 40/400 pairs", "match: 400/400 pairs")
 
 
-def test_forecast_measures_what_has_begun_and_guesses_the_rest_from_it() -> None:
-    now_s = 0.0
+class Clock:
+    """A clock that tests turn."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def run_stage(
+    clock: Clock, forecast: Forecast, name: str, total: int, unit_s: float
+) -> list[float]:
+    """Run a stage, and return how long the whole run takes by each forecast in it."""
+    whole_s = []
+    forecast.begin(name, total)
+    for number in range(1, total + 1):
+        clock.now_s += unit_s
+        forecast.advance(number)
+        left_s = forecast.left_s()
+        if left_s is not None:
+            whole_s.append(clock.now_s + left_s)
+    return whole_s
+
+
+@pytest.mark.parametrize("pace_s", [0.5, 4.0, 60.0])
+@pytest.mark.parametrize("after", ["nothing", "escalation"])
+def test_forecasts_of_whole_runs_are_right_within_a_factor_of_two(
+    pace_s: float, after: str
+) -> None:
+    clock = Clock()
+    forecast = Forecast(20, 190, clock)
+    clock.now_s += 10.0  # networks are loaded
+    found = []
+    for name, total in (("extract", 20), ("match", 190), ("verify", 190)):
+        found += run_stage(clock, forecast, name, total, COSTS[name] * pace_s)
+    map_s = COSTS["map"] * 28 * pace_s
+    found += run_stage(clock, forecast, "map", 20, map_s / 20)
+    first_model_s = clock.now_s
+    if after == "escalation":
+        forecast.expect(first_model_s)
+        found += run_stage(clock, forecast, "escalate, aliked", 10, first_model_s / 20)
+        forecast.expect(0.0)
+    found += run_stage(clock, forecast, "pictures", 20, 0.1)
+    late = [whole_s for whole_s in found if whole_s > 0][len(found) // 10 :]
+    assert max(late) <= 2.0 * clock.now_s
+    assert min(late) >= 0.5 * clock.now_s
+
+
+def test_what_is_slower_than_usual_is_learned_from_the_stages_before() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 45, clock)
+    found = run_stage(clock, forecast, "extract", 10, 30.0)
+    units = 10 + 45 * (COSTS["match"] + COSTS["verify"]) + 12 * COSTS["map"]
+    assert found[-1] == pytest.approx(30.0 * units * (1 + AFTER_SHARE), rel=0.01)
+
+
+def test_mapping_is_not_at_its_end_with_the_last_photograph() -> None:
+    clock = Clock()
+    forecast = Forecast(5, 10, clock)
+    for name, total in (("extract", 5), ("match", 10), ("verify", 10)):
+        run_stage(clock, forecast, name, total, COSTS[name] * 2.0)
+    run_stage(clock, forecast, "map", 5, 0.1)
+    before_s = forecast.left_s()
+    clock.now_s += 60.0
+    after_s = forecast.left_s()
+    assert before_s is not None
+    assert after_s is not None
+    assert before_s > 5.0
+    assert after_s > GOES_ON_SHARE * 60.0
+
+
+def test_forecasts_are_shown_with_the_stage_once_enough_is_measured() -> None:
+    clock = Clock()
     lines = io.StringIO()
-    forecast = Forecast(20, 190, clock=lambda: now_s)
-    with Progress(lines, forecast=forecast).stage("extract", 20, "images") as advance:
+    progress = Progress(lines, forecast=Forecast(20, 190, clock))
+    with progress.stage("extract", 20, "images") as advance:
         for _ in range(20):
-            now_s += 60.0
+            clock.now_s += 1.0
             advance(1)
-    minutes = 10 + 190 * (COSTS["match"] + COSTS["verify"]) + 28 * COSTS["map"]
-    assert lines.getvalue().splitlines()[4] == (
-        f"extract: 10/20 images, first model in about {minutes:.0f} min"
+    shown = lines.getvalue().splitlines()
+    assert shown[0] == "extract: 2/20 images"
+    assert re.fullmatch(
+        r"extract: 10/20 images, about (\d\d s|\d min) left in all", shown[4]
     )
-    forecast.begin("match", 190)
-    forecast.begin("verify", 190)
-    forecast.begin("map", 20)
-    now_s += 600.0
-    assert forecast.text(0.5) == ""
+    terminal = Terminal()
+    progress = Progress(terminal, forecast=Forecast(20, 190, clock))
+    with progress.stage("extract", 20, "images") as advance:
+        for _ in range(20):
+            clock.now_s += 1.0
+            advance(1)
+    assert "left in all" in terminal.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "words"), [
+    (0.0, "10 s"), (31.0, "40 s"), (100.0, "2 min"), (5000.0, "83 min"), (9000.0, "2.5 h"),
+])  # fmt: skip
+def test_durations_are_told_as_exactly_as_a_forecast_is(
+    seconds: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forecast = Forecast(1, 0)
+    monkeypatch.setattr(forecast, "left_s", lambda: seconds)
+    assert forecast.text() == f"about {words} left in all"
 
 
 def test_a_voice_speaks_after_five_seconds_and_seldomer_where_lines_stay() -> None:

@@ -12,6 +12,7 @@ from typing import TextIO
 
 from colmap_affrect import __version__, errors
 from colmap_affrect.cli.parser import build_parser
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
@@ -50,7 +51,8 @@ def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
         *(word for word in given if word != "--overwrite"),
     )
     with _logging(options):
-        from colmap_affrect.cli import commands  # not for --help
+        with Progress(None if options.quiet else sys.stderr).never_silent():
+            from colmap_affrect.cli import commands  # not for --help; takes seconds
 
         command = getattr(commands, options.command.replace("-", "_"), commands.stage)
         begin()

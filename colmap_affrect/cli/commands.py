@@ -15,6 +15,7 @@ from colmap_affrect import doctor as examination
 from colmap_affrect import pipeline
 from colmap_affrect.cli import given
 from colmap_affrect.colmap import old_databases
+from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.comparison import compare as comparing
 from colmap_affrect.comparison import tables
@@ -49,15 +50,20 @@ from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
+from colmap_affrect.report import page_server
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.line_pictures import report_lines
 from colmap_affrect.report.pairs import draw_pair
+from colmap_affrect.report.run_report import RunReport
+from colmap_affrect.report.two_runs import write_two_runs
 from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
+
+MAX_PORT = 65_535  # of TCP (theory)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -356,6 +362,25 @@ def lines(options: argparse.Namespace) -> None:
     found = report_lines(options.photographs, options.target_path)
     show(found.to_json() if options.json else found.summary())
     _refuse_failures(found.failures, options)
+
+
+def serve(options: argparse.Namespace) -> None:
+    by_hand = ByHand(rejected=tuple(options.rejected), left_out=tuple(options.left_out))
+    port = page_server.PORT if options.port is None else options.port
+    if port > MAX_PORT:
+        raise OptionError(f"--port {port}: give a number up to {MAX_PORT}")
+
+    def map_images(said: ByHand, progress: Progress) -> RunReport:
+        return pipeline.map_images(options.path, by_hand=said, progress=progress)
+
+    page_server.serve(Workspace(options.path), by_hand, port, map_images, show)
+
+
+def show_runs(options: argparse.Namespace) -> None:
+    page = write_two_runs(
+        options.before, options.after, options.page_path, given.progress(options)
+    )
+    show(f"page        {page}")
 
 
 def show_pair(options: argparse.Namespace) -> None:

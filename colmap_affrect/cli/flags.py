@@ -238,7 +238,8 @@ FLAGS: dict[str, Settings] = {
         dest="target_path"),
     "--format": _value("A,B,...", "ply (points), text (COLMAP's), undistorted (photographs and "
         "model, for dense reconstruction), nerfstudio (the same with transforms.json, for "
-        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV) "
+        "Gaussian splatting too), mvsnet (the same with the model as text), cameras (CSV), report "
+        "(the page of the run, as PDF where a browser is there) "
         "(default: ply,text,cameras; no text where names have blanks)", type=words, default=()),
     "--camera-model@export": _value("MODEL", "COLMAP camera model of text and cameras, fitted to "
         "the cameras, e.g. RADIAL for OpenSfM (default: their own)", dest="camera_model"),
@@ -266,6 +267,13 @@ FLAGS: dict[str, Settings] = {
     "--image-path@pair": _path("PATH", "folder of the photographs (default: that of the run)"),
     "--output-path@pair": _path("FILE", "PNG file to make, in no folder of photographs (default: "
         "pairs/a--b.png in the folder of the run)", dest="picture_path"),
+    "before": _path("BEFORE", "output folder of a run, or a folder of models 0, 1, ..."),
+    "after": _path("AFTER", "output folder of another run of the same photographs"),
+    "--output-path@page": _path("FILE", "HTML file to make (default: compared.html in AFTER)",
+        dest="page_path"),
+    "path@run": _path("PATH", "output folder of a run"),
+    "--port": {"metavar": "N", "type": count, "default": None, "help": "of 127.0.0.1; 0 takes one "
+        "that is free (default: 8427)"},
     "path@optional": _path("PATH", "output folder, any COLMAP database, or a model", nargs="?"),
     "name": {"nargs": "?", "help": "print this recipe with all of its options"},
     "action": {"choices": ["list", "fetch"], "nargs": "?", "default": "list",

@@ -30,6 +30,8 @@ EXAMPLES = (
     "panoramas --image-path panoramas --output-path out",
     "inspect photos/a.jpg --output-path out",
     "lines photos/a.jpg photos/b.jpg --output-path pictures",
+    "serve out",
+    "show-runs out out-2",
     "show-pair out a.jpg b.jpg",
     "show-pair any.db a.jpg b.jpg --image-path photos --output-path pair.png",
     "recipes on-demand",
@@ -271,6 +273,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "lines": (
         "what the straight lines of photographs say of their cameras: focal length, axis, upright",
         "photographs --output-path@pictures --max-failures --json"),
+    "serve": (
+        "the page of a run in a browser of this machine: marks and masks are mapped at a click",
+        "path@run --port --reject-pair --leave-out"),
+    "show-runs": (
+        "two runs of the same photographs, one laid over the other on a page: before and after",
+        "before after --output-path@page"),
     "show-pair": (
         "draw two photographs side by side, with lines between what was matched",
         "path pair --image-path@pair --output-path@pair"),

@@ -17,6 +17,7 @@ from pydantic import Field
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.masked_matches import leave_out_masked, read_painted_masks
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options, suggestion
@@ -57,6 +58,8 @@ class ByHand(Options):
     """Pairs of names of photographs whose matches are wrong."""
     left_out: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Names of photographs that are not to be mapped."""
+    masks_path: GivenPath | None = None
+    """Folder of masks painted after matching: matches below black are not mapped."""
 
     def marks(self, names: Collection[str], size_of: SizeOf = unknown_size) -> Marks:
         """Read the tie points, as :func:`read_marks` does.
@@ -100,6 +103,8 @@ class ByHand(Options):
             found.append(f"pair {first}, {second} rejected")
         for name in self.left_out:
             found.append(f"{name} left out")
+        if self.masks_path:
+            found.append(f"masks of {self.masks_path.name}")
         return tuple(found)
 
     def digest(self) -> str:
@@ -110,6 +115,10 @@ class ByHand(Options):
         found = hashlib.sha256(repr(names).encode())
         if self.tie_points_path and self.tie_points_path.is_file():
             found.update(read_regular(self.tie_points_path))
+        if self.masks_path:
+            for path in sorted(self.masks_path.rglob("*.png")):
+                found.update(str(path.relative_to(self.masks_path)).encode())
+                found.update(read_regular(path))
         return found.hexdigest()
 
     def copy_database(self, source: Path, target: Path) -> Indices:
@@ -129,11 +138,20 @@ class ByHand(Options):
         found: dict[str, Mapping[str, int]] = {}
 
         def change(database: pycolmap.Database) -> None:
+            self._leave_out_masked(database)
             found.update(self._add_tie_points(database))
             self._delete_pairs(database)
 
         copy_database(source, target, change=change)
         return found
+
+    def _leave_out_masked(self, database: pycolmap.Database) -> None:
+        """Take out matches below masks; their pairs have to be verified again."""
+        if not self.masks_path:
+            return
+        images = database.read_all_images()
+        names = {image.name: image.image_id for image in images}
+        leave_out_masked(database, read_painted_masks(self.masks_path, names))
 
     def _add_tie_points(self, database: pycolmap.Database) -> Indices:
         """Add the tie points behind the keypoints of their images; return their numbers."""

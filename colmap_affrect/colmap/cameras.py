@@ -75,7 +75,7 @@ class CameraRecord:
         return None
 
     @property
-    def is_fixed(self) -> bool:
+    def is_all_given(self) -> bool:
         """Whether nothing of the intrinsics that mapping would refine is free."""
         return {"focal", "distortion"} <= set(self.given)
 

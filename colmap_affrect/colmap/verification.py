@@ -41,6 +41,15 @@ MAX_WRITTEN_SHARE = 0.15
 MIN_CONSISTENT = 4
 # Samples that RANSAC draws at most for a pair that shows nothing in common; resource
 NUM_TRIALS_IN_VAIN = 1000
+# The same where no match at all agrees with its neighbours, as in 246 of 407 rejected pairs of
+# seven scenes; each of 826 verified ones had seven that do; measured
+NUM_TRIALS_OF_NOTHING = 100
+# COLMAP's is 3. With 1, 361 right pairs of seven scenes are verified as before, with 99.95 per
+# cent of their right inliers, in 0.8 of the time; measured
+TRIALS_PER_NEEDED_TRIAL = 1.0
+# Largest of the shares of inliers that samples must suffice for: by it a hundred homographies
+# are drawn, the fewest that COLMAP draws for any pair; theory
+MAX_LEAST_SHARE = 0.5
 # Raw matches; with more, a pair is searched in any case; resource
 MAX_NUM_LOOKED_AT = 300
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
@@ -149,7 +158,7 @@ def _significant_geometry(
     num_matches = len(keypoints[0])
     rows = _twice(np.arange(num_matches, dtype=np.uint32))
     points = (_positions(keypoints[0]), _positions(keypoints[1]))
-    search = two_view_options(_without_vain_trials(keypoints, options))
+    search = _search_options(keypoints, options)
     geometry = pycolmap.estimate_two_view_geometry(
         cameras[0], points[0], cameras[1], points[1], rows, search
     )
@@ -172,6 +181,25 @@ def _significant_geometry(
     return planar
 
 
+def _search_options(
+    keypoints: Keypoints, options: VerificationOptions
+) -> pycolmap.TwoViewGeometryOptions:
+    """Return pycolmap's options for a pair, so that the search ends when it is sure enough.
+
+    COLMAP draws several times as many samples as its confidence asks for, and those of few
+    matches for a smaller share of inliers than any pair is verified with.
+    """
+    num_matches = len(keypoints[0])
+    search = two_view_options(_without_vain_trials(keypoints, options))
+    if options.min_significance and num_matches:
+        least_share = min(options.min_num_inliers / num_matches, MAX_LEAST_SHARE)
+        search.ransac.min_inlier_ratio = max(
+            search.ransac.min_inlier_ratio, least_share
+        )
+        search.ransac.dyn_num_trials_multiplier = TRIALS_PER_NEEDED_TRIAL
+    return search
+
+
 def _without_vain_trials(
     keypoints: Keypoints, options: VerificationOptions
 ) -> VerificationOptions:
@@ -190,10 +218,11 @@ def _without_vain_trials(
         return options
     frames1 = np.concatenate([first, _positions(keypoints[0])[:, :, None]], axis=2)
     frames2 = np.concatenate([second, _positions(keypoints[1])[:, :, None]], axis=2)
-    if num_consistent_matches(frames1, frames2) >= MIN_CONSISTENT:
+    num_consistent = num_consistent_matches(frames1, frames2)
+    if num_consistent >= MIN_CONSISTENT:
         return options
-    num_trials = min(options.max_num_trials, NUM_TRIALS_IN_VAIN)
-    return options.changed(max_num_trials=num_trials)
+    most = NUM_TRIALS_IN_VAIN if num_consistent else NUM_TRIALS_OF_NOTHING
+    return options.changed(max_num_trials=min(options.max_num_trials, most))
 
 
 def _positions(keypoints: Floats) -> Array:

@@ -188,6 +188,7 @@ class Escalation:
             return Step(begun.level, self._left_of(begun))
         plan = self._plan()
         self.left_s = plan.left_s / available_cores()
+        self.context.progress.expect(self.left_s)
         return plan.step if plan.step.pairs else None
 
     def _left_of(self, begun: Begun) -> list[Pair]:
@@ -362,8 +363,6 @@ class Escalation:
         """Give images the features of a level that they lack, and match pairs with these."""
         missing = self._missing_features(pairs, level)
         title = f"escalate, {self.context.extraction.levels[level].name}"
-        if self.left_s >= 60.0:
-            title += f" (at most about {self.left_s / 60:.0f} min)"
         num_steps = len(missing) + len(pairs)
         with self.context.progress.stage(title, num_steps, "steps") as advance:
             self._extend(missing, advance)

@@ -10,7 +10,7 @@ from colmap_affrect.colmap.verification import weakly_connected_images
 from colmap_affrect.escalation.expected_gain import PairState, insecure_images
 from colmap_affrect.escalation.policy import Situation
 from colmap_affrect.mappers.mapping import read_summaries
-from colmap_affrect.mappers.sparse import LARGE
+from colmap_affrect.mappers.sparse import MIN_LARGE_SET
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
 from colmap_affrect.project.report import ModelSummary
@@ -107,7 +107,7 @@ class SetState:
         insecure &= wanted
         has_models = self.context.workspace.sparse.exists()
         # The next model tells of what has been verified since.
-        maps_next = insecure != wanted and has_models and num_images < LARGE
+        maps_next = insecure != wanted and has_models and num_images < MIN_LARGE_SET
         return set() if maps_next else insecure
 
     def _anchored(

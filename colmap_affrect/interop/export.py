@@ -24,6 +24,7 @@ from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
 from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
+from colmap_affrect.interop.printed_report import write_report
 from colmap_affrect.interop.undistortion import undistort
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.argument_types import checks_arguments
@@ -380,6 +381,10 @@ def _no_formula(text: str) -> str:
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
+def _report(source: Source, folder: Path) -> Path:
+    return write_report(source.path, folder / "report")
+
+
 @dataclass(frozen=True)
 class Format:
     """A format that models are exported to."""
@@ -398,6 +403,7 @@ FORMATS = {
     ),  # uses the folder of ``undistorted``, if it is there
     "mvsnet": Format(_mvsnet, DENSE),
     "cameras": Format(_cameras, "cameras.csv"),
+    "report": Format(_report, "report"),
 }
 
 """Formats by their names, in the order in which they are written."""

@@ -1,12 +1,13 @@
 """Bundle adjustment with priors on intrinsics.
 
-It minimises robust reprojection errors and, for each camera that is not fixed, the deviation of
+It minimises robust reprojection errors and, for each camera that is not constant, the deviation of
 focal length and distortion from their priors. COLMAP's own adjustment has no such priors: where
 few points are seen by many images, its focal lengths run away.
 """
 
+import copy
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,7 @@ from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
     usual_principal_point,
 )
-from colmap_affrect.mappers.tie_points import NONE, TiePoints
+from colmap_affrect.mappers.tie_points import NO_TIE_POINTS, TiePoints
 
 NOISE_PX = 0.7  # standard deviation of keypoints, measured on the benchmark scenes
 
@@ -104,7 +105,7 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
         camera: pycolmap.Camera,
         prior: CameraPrior,
         noise_px: float,
-        fixed: Sequence[int],
+        constant: Sequence[int],
     ) -> None:
         """Begin.
 
@@ -112,7 +113,7 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
             camera: Whose parameters are observed.
             prior: What is known of them.
             noise_px: Standard deviation of keypoints.
-            fixed: Indices of the parameters that are held, which cost nothing.
+            constant: Indices of the parameters that are constant, which cost nothing.
         """
         super().__init__()
         number = len(camera.params)
@@ -126,7 +127,7 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
         center = prior.principal_point or usual_principal_point(camera)
         self.mean[indices] = center.center_px
         self.weights[indices] = noise_px / np.array(center.sigmas_px)
-        self.weights[list(fixed)] = 0.0
+        self.weights[list(constant)] = 0.0
         self.set_num_residuals(number)
         self.set_parameter_block_sizes([number])
 
@@ -156,16 +157,35 @@ class Adjuster:
     refining: pycolmap.BundleAdjustmentOptions
     # Ids of the cameras of which nothing is refined
     constant: frozenset[int] = frozenset()
-    # Ids of the frames whose poses are fixed
+    # Ids of the frames whose poses are constant
     constant_frames: frozenset[int] = frozenset()
-    tie_points: TiePoints = NONE  # observed by all models that have two of their images
+    tie_points: TiePoints = (
+        NO_TIE_POINTS  # observed by all models that have two of their images
+    )
 
-    def set_initial_focals(self, model: pycolmap.Reconstruction) -> None:
-        """Give the cameras of a model that are not fixed the focal lengths of their priors."""
+    def set_initial_focals(
+        self, model: pycolmap.Reconstruction, used: Collection[int] = ()
+    ) -> None:
+        """Give the cameras of a model that are not constant the focal lengths of their priors.
+
+        Args:
+            model: Changed in place.
+            used: Ids of the cameras that stay as they are.
+        """
         for key, camera in model.cameras.items():
-            prior = self.priors.get(key)
-            if prior and prior.sigma and key not in self.constant:
-                camera.params[list(camera.focal_length_idxs())] = prior.focal_px
+            if key not in used:
+                self._set_initial_focal(camera)
+
+    def initial_camera(self, camera: pycolmap.Camera) -> pycolmap.Camera:
+        """Return a camera of the database as models begin with it, by its prior."""
+        initial = copy.copy(camera)
+        self._set_initial_focal(initial)
+        return initial
+
+    def _set_initial_focal(self, camera: pycolmap.Camera) -> None:
+        prior = self.priors.get(camera.camera_id)
+        if prior and prior.sigma and camera.camera_id not in self.constant:
+            camera.params[list(camera.focal_length_idxs())] = prior.focal_px
 
     def adjust(
         self,
@@ -179,8 +199,8 @@ class Adjuster:
         Args:
             model: Changed in place.
             max_iterations: Limit for Ceres.
-            image_ids: Images to adjust, all by default. The other images are fixed, and the
-                cameras that they share with these.
+            image_ids: Images to adjust, all by default. The other images are constant, and
+                the cameras that they share with these.
             early_stop: May end the adjustment before it has converged.
 
         Returns:
@@ -192,16 +212,16 @@ class Adjuster:
         images = sorted(registered if image_ids is None else set(image_ids))
         cameras = {model.images[image_id].camera_id for image_id in images}
         others = registered.difference(images)
-        fixed = {
+        constant = {
             model.images[image_id].camera_id for image_id in others
         } | self.constant
         config = self._config(
             model=model,
             image_ids=images,
-            fixed_cameras=cameras & fixed,
+            constant_cameras=cameras & constant,
             fix_gauge=image_ids is None,
         )
-        problem = self._problem(model, config, cameras - fixed)
+        problem = self._problem(model, config, cameras - constant)
         solver = _solver_options(max_iterations, len(images))
         if early_stop:
             early_stop.noise_px = self.noise_px
@@ -218,7 +238,7 @@ class Adjuster:
     ) -> pycolmap.BACovariance | None:
         """Return the covariance of the poses of a model that has been adjusted.
 
-        Three points are held, which changes nothing of what does not depend on the frame of the
+        Three points are constant, which changes nothing of what does not depend on the frame of the
         model, as relative directions. It is in units in which keypoints have a variance of one.
 
         Returns:
@@ -229,7 +249,7 @@ class Adjuster:
         config = self._config(
             model=model,
             image_ids=images,
-            fixed_cameras=cameras & self.constant,
+            constant_cameras=cameras & self.constant,
             fix_gauge=False,
         )
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
@@ -273,22 +293,22 @@ class Adjuster:
         self,
         model: pycolmap.Reconstruction,
         image_ids: Iterable[int],
-        fixed_cameras: Iterable[int],
+        constant_cameras: Iterable[int],
         *,
         fix_gauge: bool,
     ) -> pycolmap.BundleAdjustmentConfig:
-        """Return which images are adjusted, and which cameras and frames are fixed."""
+        """Return which images are adjusted, and which cameras and frames are constant."""
         config = pycolmap.BundleAdjustmentConfig()
         frames = set[int]()
         for image_id in image_ids:
             config.add_image(image_id)
             frames.add(model.images[image_id].frame_id)
-        for key in sorted(fixed_cameras):
+        for key in sorted(constant_cameras):
             config.set_constant_cam_intrinsics(key)
-        fixed_frames = frames & self.constant_frames
-        for frame_id in fixed_frames:
+        constant_frames = frames & self.constant_frames
+        for frame_id in constant_frames:
             config.set_constant_rig_from_world_pose(frame_id)
-        if fix_gauge and not fixed_frames:
+        if fix_gauge and not constant_frames:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         return config
 
@@ -319,33 +339,35 @@ class Adjuster:
                 problem.add_residual_block(cost, loss, blocks)
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
-        """Hold what of a camera is known, and add the prior of what is not."""
+        """Keep constant what of a camera is known, and add the prior of what is not."""
         prior = self.priors[camera.camera_id]
-        fixed = self._fixed_parameters(camera)
+        constant = self._constant_parameters(camera)
         number = len(camera.params)
-        if len(fixed) == number:
+        if len(constant) == number:
             problem.set_parameter_block_constant(camera.params)
             return
-        if fixed:
-            problem.set_manifold(camera.params, pyceres.SubsetManifold(number, fixed))
+        if constant:
+            problem.set_manifold(
+                camera.params, pyceres.SubsetManifold(number, constant)
+            )
         if prior.sigma:
             problem.add_residual_block(
-                IntrinsicsCost(camera, prior, self.noise_px, fixed),
+                IntrinsicsCost(camera, prior, self.noise_px, constant),
                 None,
                 [camera.params],
             )
 
-    def _fixed_parameters(self, camera: pycolmap.Camera) -> list[int]:
-        """Return the indices of the parameters of a camera that are held."""
+    def _constant_parameters(self, camera: pycolmap.Camera) -> list[int]:
+        """Return the indices of the parameters of a camera that are constant."""
         prior = self.priors[camera.camera_id]
-        fixed = list[int]()
+        constant = list[int]()
         if not (self.refining.refine_focal_length and prior.sigma):
-            fixed += camera.focal_length_idxs()
+            constant += camera.focal_length_idxs()
         if not self._is_center_free(camera.camera_id):
-            fixed += camera.principal_point_idxs()
+            constant += camera.principal_point_idxs()
         if not (self.refining.refine_extra_params and prior.has_distortion):
-            fixed += camera.extra_params_idxs()
-        return sorted(fixed)
+            constant += camera.extra_params_idxs()
+        return sorted(constant)
 
     def _is_center_free(self, camera_id: int) -> bool:
         """Tell whether the principal point of a camera is refined."""

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.geometry.lines import LineCamera
     from colmap_affrect.mappers.existing import ExistingModel
+    from colmap_affrect.mappers.pair_graph import PairGraph
     from colmap_affrect.project.report import Bridge
 
 
@@ -76,6 +77,9 @@ class MappingTask:
     may_share: bool = False
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    # graphs that pair_graph.graph_of has read, by database and fewest inliers of a pair;
+    # tasks that ``replace`` makes of this one share them
+    graphs: dict[tuple[Path, int], PairGraph] = field(default_factory=dict, repr=False)
 
     @property
     def colors_path(self) -> Path:
@@ -93,21 +97,21 @@ class MappingTask:
         if not records or not options.keep_given_intrinsics:
             return RefinedIntrinsics(focal_lengths=True, distortion=True)
         focals = not all("focal" in record.given for record in records)
-        distortion = focals or not all(record.is_fixed for record in records)
+        distortion = focals or not all(record.is_all_given for record in records)
         return RefinedIntrinsics(focals, distortion)
 
     def constant_cameras(self, options: MapperOptions) -> set[int]:
         """Return the ids of the cameras that are not to be refined.
 
         One whose focal length alone is given is among them where others are refined: pycolmap has
-        no focal length that is fixed for some cameras only.
+        no focal length that is constant for some cameras only.
         """
         if not options.keep_given_intrinsics:
             return set()
         refines_focals = self.refined_intrinsics(options).focal_lengths
         found = set[int]()
         for key, record in self.cameras.items():
-            if record.is_fixed or (refines_focals and "focal" in record.given):
+            if record.is_all_given or (refines_focals and "focal" in record.given):
                 found.add(key)
         return found
 

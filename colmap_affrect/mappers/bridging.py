@@ -22,6 +22,7 @@ from colmap_affrect.geometry.two_views import (
     scale_between,
     scale_by_planes,
 )
+from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     CameraById,
@@ -35,7 +36,7 @@ from colmap_affrect.project.report import Bridge
 
 # Judged on bridges of the benchmark scenes whose poses are known.
 # Of the longer side of an image: known depths so near are compared
-NEIGHBOR_RADIUS = 0.03
+DEPTH_RADIUS = 0.03
 # Known depths on a common plane may be so many times farther away; judged
 PLANE_RADIUS_FACTOR = 4.0
 MIN_AGREEING = 10  # depth ratios that agree with a scale; judged
@@ -97,9 +98,16 @@ class BridgeHypothesis:
 class BridgeFinder:
     """Finds bridges between models and images of one database."""
 
-    def __init__(self, graph: PairGraph, random_seed: int) -> None:
-        """Begin without any pose known."""
+    def __init__(self, graph: PairGraph, adjuster: Adjuster, random_seed: int) -> None:
+        """Begin without any pose known.
+
+        Args:
+            graph: Pairs that bridges are built by.
+            adjuster: Has the priors of cameras that a model has not used yet.
+            random_seed: For the relative poses.
+        """
         self.graph = graph
+        self.adjuster = adjuster
         self.random_seed = random_seed
         self._relative_poses: dict[tuple[Any, ...], list[RelativePose]] = {}
 
@@ -112,15 +120,16 @@ class BridgeFinder:
         return sorted(found, key=lambda hypothesis: -hypothesis.rank)
 
     def _open_pairs(self, posed: _PosedModel) -> Iterator[_OpenPair]:
-        refined = {camera.camera_id: camera for camera in posed.cameras.values()}
+        used = {camera.camera_id: camera for camera in posed.cameras.values()}
         for pair in self.graph.pairs:
             is_inside = [image_id in posed.poses for image_id in pair.ids]
             if sum(is_inside) == 1:
                 side = is_inside.index(True)
-                initial = self.graph.cameras[pair.ids[1 - side]]
-                yield _OpenPair(
-                    pair=pair, side=side, camera=refined.get(initial.camera_id, initial)
-                )
+                of_database = self.graph.cameras[pair.ids[1 - side]]
+                camera = used.get(of_database.camera_id)
+                if camera is None:
+                    camera = self.adjuster.initial_camera(of_database)
+                yield _OpenPair(pair=pair, side=side, camera=camera)
 
     def _hypotheses(
         self, posed: _PosedModel, open_pair: _OpenPair
@@ -167,7 +176,7 @@ class BridgeFinder:
         keypoints = self.graph.keypoints[image_id]
         positions = keypoints[relative.matches[:, side]].astype(np.float64)
         own = positions, relative.depths[side]
-        radius = NEIGHBOR_RADIUS * max(camera.width, camera.height)
+        radius = DEPTH_RADIUS * max(camera.width, camera.height)
         scale = scale_between(known, own, radius)
         if not _is_certain(scale):
             scale = scale_by_planes(known, own, PLANE_RADIUS_FACTOR * radius)

@@ -15,10 +15,10 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.adjustment import Adjuster
 
-MAX_NUM_IMAGES = 100
+MAX_COVARIANCE_IMAGES = 100
 """Larger models are not looked at: the time grows with the cube of the images, and half of so many
 hardly stand at one place; resource."""
-NOT_HELD_DEG = 180.0
+UNDETERMINED_DEG = 180.0
 """From this deviation on a direction may be any: what tracks tell is off by a few degrees, what
 they do not tell by thousands; theory."""
 
@@ -28,7 +28,7 @@ def direction_sigmas_deg(
 ) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are.
 
-    Directions that tracks do not hold at all are passed over: the scale of bridges is known by
+    Directions that tracks do not determine are passed over: the scale of bridges is known by
     something else (:mod:`colmap_affrect.mappers.bridging`), of which the covariance knows nothing.
 
     Args:
@@ -41,7 +41,7 @@ def direction_sigmas_deg(
     """
     image_ids = sorted(model.reg_image_ids())
     # A limit of time, other than that of focal_observability
-    if not 3 <= len(image_ids) <= MAX_NUM_IMAGES:
+    if not 3 <= len(image_ids) <= MAX_COVARIANCE_IMAGES:
         return {}
     if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):
         return {}  # COLMAP has no covariances of rigs
@@ -54,21 +54,23 @@ def direction_sigmas_deg(
         return {}
     num_needed = math.ceil((len(image_ids) - 1) / 2)
     found = dict[int, float]()
-    for image_id, sigmas_deg in _held(model, covariance, adjuster.noise_px).items():
+    for image_id, sigmas_deg in _determined(
+        model, covariance, adjuster.noise_px
+    ).items():
         if len(sigmas_deg) >= num_needed:
             found[image_id] = sorted(sigmas_deg)[num_needed - 1]
     return found
 
 
-def _held(
+def _determined(
     model: pycolmap.Reconstruction, covariance: pycolmap.BACovariance, noise_px: float
 ) -> dict[int, list[float]]:
-    """Return the deviations of the directions of each image that tracks hold, in degrees."""
+    """Return the deviations of the directions of each image that tracks determine, in degrees."""
     image_ids = sorted(model.reg_image_ids())
     found: dict[int, list[float]] = {image_id: [] for image_id in image_ids}
     for first, second in itertools.combinations(image_ids, 2):
         sigma_deg = noise_px * _direction_sigma_deg(model, covariance, first, second)
-        if sigma_deg < NOT_HELD_DEG:
+        if sigma_deg < UNDETERMINED_DEG:
             found[first].append(sigma_deg)
             found[second].append(sigma_deg)
     return found

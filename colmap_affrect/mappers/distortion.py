@@ -14,7 +14,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.mappers.camera_priors import CameraPrior
-from colmap_affrect.mappers.model_score import GRID
+from colmap_affrect.mappers.model_score import GRID, grid_cells
 from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     num_matched_images,
@@ -58,11 +58,8 @@ def redundancy_of(
         keypoints: (N, 2) px.
         num_partners: (N,) numbers of other images in which they are matched.
     """
-    cells = (keypoints / [camera.width, camera.height] * GRID).astype(np.int64)
-    columns, rows = np.clip(cells, 0, GRID - 1).T
-    numbers: Indices = columns + GRID * rows
     most = np.zeros(GRID * GRID, np.int64)
-    np.maximum.at(most, numbers, num_partners)
+    np.maximum.at(most, grid_cells(camera, keypoints), num_partners)
     num_views = most[most > 0] + 1
     return max(0.0, float((2.0 - 3.0 / num_views).sum()) - NUM_POSE_PARAMETERS)
 

@@ -48,7 +48,7 @@ def complete_points(
     by_hand = {mark.point3D_id for _, _, mark in tie_points.observed(model)}
     _refine(
         model=model,
-        held=by_hand,
+        constant=by_hand,
         loss=pycolmap.LossFunctionType.CAUCHY,
         noise_px=noise_px,
     )
@@ -57,7 +57,7 @@ def complete_points(
     if failing:
         _refine(
             model=model,
-            held=model.point3D_ids() - failing,
+            constant=model.point3D_ids() - failing,
             loss=pycolmap.LossFunctionType.TRIVIAL,
             noise_px=noise_px,
         )
@@ -71,7 +71,7 @@ def _correspondences(
 ) -> pycolmap.CorrespondenceGraph:
     """Return the inliers of the pairs among a model's images, but for those it contradicts."""
     inside = set(model.reg_image_ids())
-    against = graph.contradicted(model)
+    against = graph.contradicted_verified(model)
     found = pycolmap.CorrespondenceGraph()
     for image_id in sorted(inside):
         found.add_image(image_id, model.images[image_id].num_points2D())
@@ -115,7 +115,7 @@ def _observation_error_px(
 
 def _refine(
     model: pycolmap.Reconstruction,
-    held: set[int],
+    constant: set[int],
     loss: pycolmap.LossFunctionType,
     noise_px: float,
 ) -> None:
@@ -123,7 +123,7 @@ def _refine(
 
     Args:
         model: Changed in place.
-        held: Ids of the points that stay, too.
+        constant: Ids of the points that stay, too.
         loss: How much an error costs.
         noise_px: Scale of the loss, px, where it is a robust one.
     """
@@ -139,7 +139,7 @@ def _refine(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
-    for point_id in sorted(held):
+    for point_id in sorted(constant):
         config.add_constant_point(point_id)
     poses = _pose_parameters(model)
     before = [pose.copy() for pose in poses]

@@ -35,7 +35,7 @@ NUM_ITERATIONS = 100
 # More cameras than that are tried several at once, to save time; resource
 MAX_NUM_TRIALS = 12
 # Larger models have points of many images, which tell focal lengths; resource
-MAX_NUM_IMAGES = 100
+MAX_TRIAL_IMAGES = 100
 MAX_NUM_POINTS = 2_000  # of a model that is tried, to save time; resource
 MAX_NUM_OBSERVATIONS = 3_000
 """The same of a model of rigs: with the poses of the sensors as unknowns, too, each observation
@@ -108,7 +108,7 @@ def focal_growths(
     unknown = [key for key in recorded if priors[key].is_unknown]
     if not unknown or not _is_tried(model):
         return {}
-    fixed = frozenset(key for key in recorded if task.cameras[key].is_fixed)
+    fixed = frozenset(key for key in recorded if task.cameras[key].is_all_given)
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not is_straight)
     trials = _FocalTrials(with_fewer_points(model), priors, refining, fixed)
@@ -148,7 +148,7 @@ def fitting_focals(
     for key in given:
         free_priors[key] = replace(priors[key], sigma=FREE_SIGMA)
     # A wrong focal length is made up for by distortion, where that was free.
-    constant = frozenset(key for key in given if task.cameras[key].is_fixed)
+    constant = frozenset(key for key in given if task.cameras[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
     fixed = with_fewer_points(model)
     fixed_cost = Adjuster(
@@ -190,8 +190,8 @@ def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
 
 
 def _is_tried(model: pycolmap.Reconstruction) -> bool:
-    # A limit of models, other than sparse.LARGE, which is one of photographs
-    return model.num_reg_images() <= MAX_NUM_IMAGES and model.num_points3D() > 0
+    # A limit of models, other than sparse.MIN_LARGE_SET, which is one of photographs
+    return model.num_reg_images() <= MAX_TRIAL_IMAGES and model.num_points3D() > 0
 
 
 def num_independent(model: pycolmap.Reconstruction) -> int:

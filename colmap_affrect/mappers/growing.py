@@ -37,7 +37,7 @@ NUM_ALWAYS_ADJUSTED = 10
 GROWTH = 1.15
 NUM_LAST_ROUNDS = 2  # of triangulation and adjustment at the end (resource)
 # Bridges that are built from one model before it is called complete (resource)
-MAX_TRIALS = 5
+MAX_BRIDGES_IN_VAIN = 5
 
 
 class Grower:
@@ -63,8 +63,8 @@ class Grower:
         self.native = native
         self.show = show
         self.options = native.get_mapper()
-        self.options_of_few = native.get_mapper()
-        self.options_of_few.abs_pose_min_num_inliers = min(
+        self.options_for_few_matches = native.get_mapper()
+        self.options_for_few_matches.abs_pose_min_num_inliers = min(
             MIN_FEW_POINTS, self.options.abs_pose_min_num_inliers
         )
         self.triangulation = native.get_triangulation()
@@ -85,15 +85,19 @@ class Grower:
             self.adjuster.set_initial_focals(model)
             options = self._options_of_first()
             pose = mapper.estimate_initial_two_view_geometry(options, *pair)
-            pose = pose or self._pose_of_few(model, pair)
+            pose = pose or self._pose_by_few_matches(model, pair)
             if pose is None:
                 return None
             mapper.register_initial_image_pair(options, *pair, pose)
             self._triangulate(mapper, pair)
             self._adjust(mapper, FAST)
             self.show(len(pair))
-            is_of_few = not self.graph.with_few_only.isdisjoint(pair)
-            if model.num_points3D() < (MIN_FEW_POINTS if is_of_few else MIN_POINTS):
+            has_few_matches = not self.graph.images_with_few_matches_only.isdisjoint(
+                pair
+            )
+            if model.num_points3D() < (
+                MIN_FEW_POINTS if has_few_matches else MIN_POINTS
+            ):
                 return None
             self._complete(mapper)
         return model
@@ -106,11 +110,15 @@ class Grower:
         options.init_min_num_inliers = min(options.init_min_num_inliers, enough)
         return options
 
-    def _pose_of_few(
+    def _pose_by_few_matches(
         self, model: pycolmap.Reconstruction, ids: tuple[int, int]
     ) -> pycolmap.Rigid3d | None:
         """Return cam2_from_cam1 of a pair with few matches: COLMAP begins with no such pair."""
-        few = [pair for pair in self.graph.pairs if pair.ids == ids and pair.is_few]
+        few = [
+            pair
+            for pair in self.graph.pairs
+            if pair.ids == ids and pair.has_few_matches
+        ]
         if not few:
             return None
         cameras = {i: model.cameras[model.images[i].camera_id] for i in ids}
@@ -164,7 +172,8 @@ class Grower:
 
         Args:
             poses: cam_from_world by image id; images that the model has already stay.
-            cameras: Cameras of these images, taken over where the model has not used them yet.
+            cameras: Cameras of these images, taken over where the model has not used them yet;
+                others that it has not used begin with their priors.
             model: Changed in place; may be empty.
 
         Returns:
@@ -172,6 +181,7 @@ class Grower:
         """
         used = {model.images[i].camera_id for i in model.reg_image_ids()}
         model.load(self.graph.cache)
+        self.adjuster.set_initial_focals(model, used)
         for image_id, (rotation, translation) in poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
@@ -213,10 +223,12 @@ class Grower:
 
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
         """Register one more image by points that it sees; return its id."""
-        with_few = self.graph.with_few_only
-        options = self.options_of_few if with_few else self.options
+        with_few = self.graph.images_with_few_matches_only
+        options = self.options_for_few_matches if with_few else self.options
         for image_id in mapper.find_next_images(options, False):
-            options = self.options_of_few if image_id in with_few else self.options
+            options = (
+                self.options_for_few_matches if image_id in with_few else self.options
+            )
             if mapper.register_next_image(options, image_id):
                 return image_id
         return None
@@ -277,7 +289,7 @@ def register_bridges(
     has_grown = True
     while has_grown:
         has_grown = False
-        for hypothesis in bridges.find(model)[:MAX_TRIALS]:
+        for hypothesis in bridges.find(model)[:MAX_BRIDGES_IN_VAIN]:
             image_id = hypothesis.image_id
             grown = grower.register_at(
                 {image_id: hypothesis.pose},

@@ -47,8 +47,8 @@ from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_pro
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
 (theory)."""
-# What was begun is removed while a call of COLMAP may still write there.
 ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
+# What was begun is removed while a call of COLMAP may still write there.
 NUM_REMOVALS = 5  # times that this is tried; resource
 REMOVAL_INTERVAL_S = 0.05  # between them; resource
 
@@ -307,32 +307,57 @@ def _no_surer_than_ties(
 ) -> dict[str, Confidence]:
     """Return confidences of which those of bridged images are at most what they hang on.
 
+    A bridged image hangs on the surest image that an agreeing pair ties it to; where that is a
+    bridged one, on what that hangs on, too. So what counts is the way to an image that was not
+    bridged whose least sure image is surest. Images that no such way leads to stay as they are.
+
     Args:
         confidences: By image name.
         mapped: The model.
         task: What it was made from.
     """
+    partners = _agreeing_partners(mapped, task)
+    left = sorted(mapped.bridges.keys() & confidences.keys())
+    found = {name: one for name, one in confidences.items() if name not in left}
+    while left:
+        best: tuple[float, str, str] | None = None
+        for name in left:
+            for other in sorted(partners[name] & found.keys()):
+                probability = found[other].probability
+                if best is None or probability > best[0]:
+                    best = probability, name, other
+        if best is None:
+            break
+        _, name, other = best
+        found[name] = _no_surer_than(confidences[name], other, found[other])
+        left.remove(name)
+    return {name: found.get(name, one) for name, one in confidences.items()}
+
+
+def _no_surer_than(one: Confidence, other_name: str, other: Confidence) -> Confidence:
+    """Return the confidence in an image that hangs on another one, whose name the reason says."""
+    if other.probability >= one.probability:
+        return one
+    percent = math.floor(100.0 * other.probability)
+    doubt = Doubt("hangs_on", {"other": other_name, "percent": percent})
+    reasons = (doubt, *one.reasons)[:NUM_REASONS]
+    return replace(one, probability=other.probability, reasons=reasons)
+
+
+def _agreeing_partners(
+    mapped: MappedModel, task: MappingTask
+) -> defaultdict[str, set[str]]:
+    """Return the images that pairs which agree with a model tie each of its images to, by name."""
     graph = graph_of(task, MIN_NUM_MATCHES)
     poses = poses_of(mapped.reconstruction)
     cameras = cameras_of(mapped.reconstruction)
-    ties = defaultdict[str, dict[str, float]](dict)
+    partners = defaultdict[str, set[str]](set)
     for pair in graph.pairs_inside(poses):
         if graph.agreement(pair, poses, cameras) >= MIN_SHARE:
             first, second = (graph.names[image_id] for image_id in pair.ids)
-            ties[first][second] = confidences[second].probability
-            ties[second][first] = confidences[first].probability
-    found = dict(confidences)
-    for name in mapped.bridges.keys() & confidences.keys():
-        surest = max(ties[name], key=lambda other: ties[name][other], default=None)
-        if surest is None or ties[name][surest] >= confidences[name].probability:
-            continue
-        percent = math.floor(100.0 * ties[name][surest])
-        doubt = Doubt("hangs_on", {"other": surest, "percent": percent})
-        reasons = (doubt, *confidences[name].reasons)[:NUM_REASONS]
-        found[name] = replace(
-            confidences[name], probability=ties[name][surest], reasons=reasons
-        )
-    return found
+            partners[first].add(second)
+            partners[second].add(first)
+    return partners
 
 
 def _deregister(model: pycolmap.Reconstruction, name: str) -> list[str]:

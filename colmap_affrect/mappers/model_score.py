@@ -9,6 +9,7 @@ More images that agree raise the score; images that agree with nothing do not.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -75,17 +76,30 @@ class ModelScorer:
         log_ratios = self.track_log_ratios(model).values()
         return min(log_ratios, default=MIN_SCORE_GAIN) >= MIN_SCORE_GAIN
 
-    def track_log_ratios(self, model: pycolmap.Reconstruction) -> dict[int, float]:
+    def track_log_ratios(
+        self,
+        model: pycolmap.Reconstruction,
+        viewpoint_of: Mapping[int, int] | None = None,
+    ) -> dict[int, float]:
         """Return the log-likelihood ratio of each image's features that two others match.
 
         Right are as many of the grid cells of the image that hold such features as is the share of
         these features whose point three images see, or more.
+
+        Args:
+            model: The model.
+            viewpoint_of: Of images from the same viewpoint, which count as one, a common number
+                by image id; others have none.
+
+        Returns:
+            The ratios, by image id.
         """
-        num_partners = self._num_partners(model)
+        viewpoint_of = viewpoint_of or {}
+        num_partners = self._num_partners(model, viewpoint_of)
         points = {
             image_id: seen_points(model.images[image_id]) for image_id in num_partners
         }
-        long_tracks = _seen_by_three(points)
+        long_tracks = _seen_by_three(points, viewpoint_of)
         log_ratios = {}
         for image_id, number in num_partners.items():
             features = np.flatnonzero(number > 1)
@@ -106,17 +120,30 @@ class ModelScorer:
             self._num_cells[pair.ids] = min(counts)
         return self._num_cells[pair.ids]
 
-    def _num_partners(self, model: pycolmap.Reconstruction) -> dict[int, Indices]:
+    def _num_partners(
+        self, model: pycolmap.Reconstruction, viewpoint_of: Mapping[int, int]
+    ) -> dict[int, Indices]:
         """Return in how many other images of the model each feature is matched, by image id."""
         inside = sorted(self.graph.keypoints.keys() & set(model.reg_image_ids()))
         num_keypoints = {i: len(self.graph.keypoints[i]) for i in inside}
-        return num_matched_images(num_keypoints, self.graph.pairs_inside(inside))
+        pairs = self.graph.pairs_inside(inside)
+        return num_matched_images(num_keypoints, pairs, viewpoint_of)
+
+
+def grid_cells(camera: pycolmap.Camera, points: Floats) -> Indices:
+    """Return the number of the cell of a grid over an image that holds each point, (N,).
+
+    Args:
+        camera: Of the image.
+        points: (N, 2) px; those outside of the image are of the nearest cell.
+    """
+    cells = (points / [camera.width, camera.height] * GRID).astype(np.int64)
+    return np.asarray(np.clip(cells, 0, GRID - 1) @ [1, GRID])
 
 
 def num_occupied_cells(camera: pycolmap.Camera, points: Floats) -> int:
     """Return how many cells of a grid over an image hold points, (N, 2) px."""
-    cells = (points / [camera.width, camera.height] * GRID).astype(int)
-    return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
+    return len(np.unique(grid_cells(camera, points)))
 
 
 def pair_log_ratio(num_agreeing: float, num: float) -> float:
@@ -129,12 +156,26 @@ def pair_log_ratio(num_agreeing: float, num: float) -> float:
     return float(np.logaddexp(math.log(1.0 - WRONG_PAIR) + ratio, math.log(WRONG_PAIR)))
 
 
-def _seen_by_three(points: Mapping[int, Indices]) -> Indices:
-    """Return the ids of the points that three images or more see, of those by keypoint."""
-    ids, num_observations = np.unique(
-        np.concatenate([*points.values(), [-1]]), return_counts=True
-    )
-    return np.asarray(ids[(num_observations > 2) & (ids >= 0)])
+def _seen_by_three(
+    points: Mapping[int, Indices], viewpoint_of: Mapping[int, int]
+) -> Indices:
+    """Return the ids of the points that images from three viewpoints or more see.
+
+    Args:
+        points: Ids of the points by keypoint, -1 of none, by image id.
+        viewpoint_of: As :meth:`ModelScorer.track_log_ratios` takes it.
+    """
+    seen = list[Indices]()
+    seen_from = defaultdict[int, list[Indices]](list)
+    for image_id, ids in points.items():
+        if image_id in viewpoint_of:
+            seen_from[viewpoint_of[image_id]].append(ids)
+        else:
+            seen.append(ids)
+    for of_images in seen_from.values():
+        seen.append(np.unique(np.concatenate(of_images)))
+    ids, num_viewpoints = np.unique(np.concatenate([*seen, [-1]]), return_counts=True)
+    return np.asarray(ids[(num_viewpoints > 2) & (ids >= 0)])
 
 
 def _log_ratio(num_agreeing: float, num: float, right: Beta) -> float:

@@ -2,10 +2,10 @@
 
 import copy
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -50,7 +50,7 @@ MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel tell no depth, nor which side of a camera a point is on (judged)."""
 # Inliers of a pair that are sampled for agreement and relative poses; resource
 MAX_MATCHES = 500
-MAX_TRIALS = 1000  # of RANSAC, for a relative pose; resource
+MAX_RANSAC_TRIALS = 1000  # of RANSAC, for a relative pose; resource
 # The strongest of each image that models are scored by (resource)
 MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15  # inliers of a pair; COLMAP's min_num_matches
@@ -64,7 +64,7 @@ class VerifiedPair:
     ids: Ids
     matches: Indices  # (M, 2) features that are inliers
     geometry: pycolmap.TwoViewGeometry  # of the pair in the database
-    is_few: bool = False  # it has few matches, which are sure all the same
+    has_few_matches: bool = False  # it has few matches, which are sure all the same
 
 
 Pairs = tuple[VerifiedPair, ...]
@@ -127,7 +127,7 @@ class PairGraph:
             graph = cls.of(database, min_num_matches)
             enough = {pair.ids: pair.matches for pair in graph.verified}
             few = sure_few_matches(database, enough)
-            return graph._with_few(few, database) if few else graph
+            return graph._with_few_matches(few, database) if few else graph
 
     @classmethod
     def of(
@@ -155,7 +155,9 @@ class PairGraph:
         kept = [pair for pair in self.verified if pair.ids not in ids]
         return self._with(kept, self.cache)
 
-    def _with_few(self, few: Iterable[FewMatches], database: pycolmap.Database) -> Self:
+    def _with_few_matches(
+        self, few: Iterable[FewMatches], database: pycolmap.Database
+    ) -> Self:
         """Add pairs with few matches, whose keypoints a database has."""
         verified = [*self.verified]
         keypoints = {**self.keypoints}
@@ -169,9 +171,11 @@ class PairGraph:
         return replace(self, keypoints=keypoints)._with(verified, self.cache)
 
     @cached_property
-    def with_few_only(self) -> frozenset[int]:
+    def images_with_few_matches_only(self) -> frozenset[int]:
         """The images none of whose pairs has many matches."""
-        with_many = _images_of(pair for pair in self.verified if not pair.is_few)
+        with_many = _images_of(
+            pair for pair in self.verified if not pair.has_few_matches
+        )
         return frozenset(_images_of(self.verified) - with_many)
 
     @property
@@ -185,7 +189,7 @@ class PairGraph:
         return any(rig.num_sensors() > 1 for rig in self.cache.rigs.values())
 
     @cached_property
-    def most_connected(self) -> frozenset[int]:
+    def largest_component(self) -> frozenset[int]:
         """The images of the largest connected component."""
         components = connected_parts(pair.ids for pair in self.pairs)
         return frozenset(components[0] if components else ())
@@ -225,7 +229,7 @@ class PairGraph:
         """Return a graph of other pairs, with the cameras and images of a cache."""
         kept = list[VerifiedPair]()
         for pair in verified:
-            least = MIN_FEW if pair.is_few else self.min_num_matches
+            least = MIN_FEW if pair.has_few_matches else self.min_num_matches
             if len(pair.matches) >= least:
                 kept.append(pair)
         new = empty_copy(cache, {})
@@ -261,8 +265,7 @@ class PairGraph:
 
     def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
         """Return the pairs both of whose images are among some."""
-        inside = set(image_ids)
-        return [pair for pair in self.pairs if inside.issuperset(pair.ids)]
+        return _pairs_among(self.pairs, image_ids)
 
     def agreement(
         self, pair: VerifiedPair, poses: PoseById, cameras: CameraById
@@ -297,10 +300,19 @@ class PairGraph:
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
+        return self._contradicted(self.pairs, model)
+
+    def contradicted_verified(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
+        """Return the same of all verified pairs, also those not among the strongest."""
+        return self._contradicted(self.verified, model)
+
+    def _contradicted(
+        self, pairs: Pairs, model: pycolmap.Reconstruction
+    ) -> frozenset[Ids]:
         poses = poses_of(model)
         cameras = cameras_of(model)
         found = set[Ids]()
-        for pair in self.pairs_inside(poses):
+        for pair in _pairs_among(pairs, poses):
             if self.agreement(pair, poses, cameras) < MIN_SHARE:
                 found.add(pair.ids)
         return frozenset(found)
@@ -334,7 +346,7 @@ class PairGraph:
     ) -> list[Pose]:
         options = pycolmap.RANSACOptions(
             max_error=MAX_ERROR_PX,
-            max_num_trials=MAX_TRIALS,
+            max_num_trials=MAX_RANSAC_TRIALS,
             random_seed=max(random_seed, 0),
         )
         candidates = list[Pose]()
@@ -350,10 +362,17 @@ class PairGraph:
         return candidates
 
 
-@lru_cache(maxsize=1)
 def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
-    """Return the graph of what is to be mapped; what was asked for last is not read again."""
-    return PairGraph.read(task.database_path, min_num_matches)
+    """Return the graph of what is to be mapped; it is read once for a task.
+
+    Args:
+        task: Names the database. Tasks that ``replace`` makes of it have the same graph.
+        min_num_matches: Pairs with fewer inliers are left out.
+    """
+    key = task.database_path, min_num_matches
+    if key not in task.graphs:
+        task.graphs[key] = PairGraph.read(*key)
+    return task.graphs[key]
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
@@ -376,20 +395,32 @@ def used_cameras(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
 
 
 def num_matched_images(
-    num_keypoints: Mapping[int, int], pairs: Iterable[VerifiedPair]
+    num_keypoints: Mapping[int, int],
+    pairs: Iterable[VerifiedPair],
+    viewpoint_of: Mapping[int, int] | None = None,
 ) -> dict[int, Indices]:
     """Return in how many other images each feature is matched, by image id.
 
     Args:
         num_keypoints: Of each image.
         pairs: Pairs of these images.
+        viewpoint_of: Of images from the same viewpoint, which count as one, a common number by
+            image id; others have none.
     """
+    viewpoint_of = viewpoint_of or {}
+    matched = defaultdict[tuple[int, int], list[Indices]](list)
+    for pair in pairs:
+        first, second = pair.ids
+        viewpoint1 = viewpoint_of.get(first, first)
+        viewpoint2 = viewpoint_of.get(second, second)
+        if viewpoint1 != viewpoint2:
+            matched[first, viewpoint2].append(pair.matches[:, 0])
+            matched[second, viewpoint1].append(pair.matches[:, 1])
     found = {}
     for image_id, number in num_keypoints.items():
         found[image_id] = np.zeros(number, np.int64)
-    for pair in pairs:
-        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
-            found[image_id][np.unique(features)] += 1
+    for (image_id, _), features in matched.items():
+        found[image_id][np.unique(np.concatenate(features))] += 1
     return found
 
 
@@ -450,6 +481,13 @@ def _read_pairs(
             ids = pycolmap.pair_id_to_image_pair(pair_id)
             verified.append(VerifiedPair(ids, matches, geometry))
     return verified
+
+
+def _pairs_among(
+    pairs: Iterable[VerifiedPair], image_ids: Collection[int]
+) -> list[VerifiedPair]:
+    inside = set(image_ids)
+    return [pair for pair in pairs if inside.issuperset(pair.ids)]
 
 
 def _images_of(pairs: Iterable[VerifiedPair]) -> set[int]:

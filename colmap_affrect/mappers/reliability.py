@@ -26,7 +26,8 @@ MAX_THREE_VIEW_POINTS = 300  # more points make no photograph surer; judged
 USUAL_ROTATION_RATIO = 0.5
 # Of focal lengths: farther apart they are no surer parts of others; judged
 MAX_LOG_SPREAD = 0.5
-# A bridge edge between two components may be of two scenes, found by chance among all pairs.
+# A pair that alone connects two components (a bridge of the graph) may be of two scenes, found
+# by chance among all pairs.
 CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (judged)
 # Inliers more that make the former less likely by a factor of e (judged)
 CHANCE_SCALE = 10.0
@@ -142,13 +143,13 @@ class Confidence:
     probability: float  # that its pose is right
     reasons: tuple[Doubt, ...]  # what speaks most against that
     gain: float = 0.0  # what more matches may add to the probability
-    noise_share: float = 1.0
+    precision_factor: float = 1.0
     """Factor of the probability for what noise leaves open, which is no sign of a wrong pose."""
 
     @property
     def of_evidence(self) -> float:
         """Probability by what speaks for and against the pose alone."""
-        return self.probability / self.noise_share
+        return self.probability / self.precision_factor
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     coefficients = _coefficients()
     log_odds = coefficients.constant + features.tie_point_log_odds
     odds_of_two_scenes = _odds_of_two_scenes(features)
-    share_of_directions = _share_of_directions(features)
+    factor = _precision_factor(features)
     losses = _other_losses(features)
     mendable = 0.0
     for name, fitted in coefficients.terms.items():
@@ -216,27 +217,25 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = (
-        _probability(log_odds) * share_of_directions / (1.0 + odds_of_two_scenes)
-    )
-    with_matches = _probability(log_odds + mendable) * share_of_directions
+    probability = _probability(log_odds) * factor / (1.0 + odds_of_two_scenes)
+    with_matches = _probability(log_odds + mendable) * factor
     gain = with_matches - probability
     return Confidence(
         probability=probability,
         reasons=_main_reasons(losses),
         gain=gain,
-        noise_share=share_of_directions,
+        precision_factor=factor,
     )
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
     """Return what is taken beside the terms of the regression."""
     losses = [_Loss(-features.tie_point_log_odds, Doubt("tie_points_disagree"))]
-    if features.bridge_edge:
+    if features.cut_pair:
         odds = _odds_of_two_scenes(features)
-        num_inliers = features.num_bridge_inliers
+        num_inliers = features.num_cut_pair_inliers
         edge = Doubt(
-            "bridge_edge", {"num_inliers": num_inliers, "pair": features.bridge_edge}
+            "bridge_edge", {"num_inliers": num_inliers, "pair": features.cut_pair}
         )
         losses.append(_Loss(math.log1p(odds), edge))
     if features.direction_sigma_deg:
@@ -251,13 +250,13 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
-    """Return the odds that a bridge edge connects two scenes, 0 where there is none."""
-    if not features.bridge_edge:
+    """Return the odds that the cut pair of an image is of two scenes, 0 where it has none."""
+    if not features.cut_pair:
         return 0.0
-    return math.exp((CHANCE_INLIERS - features.num_bridge_inliers) / CHANCE_SCALE)
+    return math.exp((CHANCE_INLIERS - features.num_cut_pair_inliers) / CHANCE_SCALE)
 
 
-def _share_of_directions(features: ReliabilityFeatures) -> float:
+def _precision_factor(features: ReliabilityFeatures) -> float:
     """Return the probability that what is left open moves a pose by less than the limit."""
     sigma_deg = math.hypot(features.direction_sigma_deg, features.axis_turn_deg)
     return _share_within_limit(sigma_deg)

@@ -30,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
     sampling_step,
 )
-from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs, viewpoints
 from colmap_affrect.mappers.tie_points import (
     TiePoints,
     tie_point_log_odds,
@@ -77,14 +77,14 @@ class ReliabilityFeatures:
     """Longest by shortest focal length of the photographs of its size, of those that only the model
     tells: parts of photographs have longer ones, and their middle is elsewhere."""
     tie_point_log_odds: float  # of a right pose, by its tie points
-    bridge_edge: str
+    cut_pair: str
     """The pair without which it and others, at most half of all, would be apart, or empty."""
-    num_bridge_inliers: int  # of that pair
+    num_cut_pair_inliers: int  # of that pair
     direction_sigma_deg: float = 0.0
     """Deviation that the directions of translation to at least half of the others do not exceed."""
     axis_turn_deg: float = 0.0
     """How far its rotations to others change with free principal points, where points contradict
-    those that are held and nothing tells where they are."""
+    those that are constant and nothing tells where they are."""
 
 
 class _ModelContext:
@@ -113,14 +113,20 @@ class _ModelContext:
             for image_id in pair.ids:
                 self.pairs_of[image_id].append(pair)
         self.pairs_of_frames = self._pairs_of_frames()
-        self.same_viewpoint = same_viewpoint_pairs(self.graph, task.image_path)
+        same_viewpoint = same_viewpoint_pairs(self.graph, task.image_path)
+        self.viewpoint_of = viewpoints(same_viewpoint)
 
     def frame_of(self, image_id: int) -> int:
         """Return the frame of an image: all that a rig took at once is one."""
         return self.model.images[image_id].frame_id
 
+    def is_of_one_viewpoint(self, pair: VerifiedPair) -> bool:
+        """Tell whether both images of a pair were taken from the same viewpoint."""
+        viewpoint1, viewpoint2 = (self.viewpoint_of.get(i, i) for i in pair.ids)
+        return viewpoint1 == viewpoint2
+
     def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
-        """Return the pairs of each frame with others: poses inside a rig hold each other."""
+        """Return the pairs of each frame with others: poses inside a rig determine each other."""
         found: dict[int, list[VerifiedPair]] = {
             self.frame_of(i): [] for i in self.pairs_of
         }
@@ -149,15 +155,17 @@ def features_of(
     context = _ModelContext(mapped, task)
     if growths is None:
         growths = focal_growths(context.model, task)
-    track_log_ratios = context.scorer.track_log_ratios(context.model)
-    num_three_view_points = _num_three_view_points(context)
+    track_log_ratios = context.scorer.track_log_ratios(
+        context.model, context.viewpoint_of
+    )
+    num_three_view_points = num_long_tracks(context.model, context.viewpoint_of)
     rotation_ratios = _rotation_ratios(context)
     originals = _mirrored_originals(context)
     fitting_focals_px = fitting_focals(context.model, task, context.priors)
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
-    bridges = _bridge_edges(context)
+    bridges = _cut_pairs(context)
     directions_deg = _direction_sigmas_deg(context, tie_points)
     names = context.graph.names
     found = {}
@@ -184,8 +192,8 @@ def features_of(
             else "",
             focal_spread=focal_spreads.get((camera.width, camera.height), 1.0),
             tie_point_log_odds=log_odds.get(image_id, 0.0),
-            bridge_edge=" - ".join(names[i] for i in bridge.ids) if bridge else "",
-            num_bridge_inliers=len(bridge.matches) if bridge else 0,
+            cut_pair=" - ".join(names[i] for i in bridge.ids) if bridge else "",
+            num_cut_pair_inliers=len(bridge.matches) if bridge else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
         )
@@ -196,28 +204,24 @@ def _pair_log_ratio(context: _ModelContext, image_id: int) -> float:
     """Return the log-likelihood ratio of an image by its pairs from other viewpoints."""
     total = 0.0
     for pair in context.pairs_of[image_id]:
-        if pair.ids not in context.same_viewpoint:
+        if not context.is_of_one_viewpoint(pair):
             num = context.scorer.num_cells(pair)
             total += pair_log_ratio(context.agreements[pair.ids] * num, num)
     return total
 
 
 def _agreeing_share(context: _ModelContext, image_id: int) -> float:
-    """Return the share of the inliers of an image's pairs that agree with the model."""
-    pairs = context.pairs_of[image_id]
-    if not pairs:
-        return 1.0
-    shares = [context.agreements[pair.ids] for pair in pairs]
-    weights = [len(pair.matches) for pair in pairs]
-    return float(np.average(shares, weights=weights))
+    """Return the share of the inliers of an image's pairs that agree with the model.
 
-
-def _num_three_view_points(context: _ModelContext) -> Mapping[int, int]:
-    """Return the number of points of three viewpoints, by image id."""
-    viewpoint_of = dict[int, int]()
-    for first, second in sorted(context.same_viewpoint):
-        viewpoint_of[second] = viewpoint_of.get(first, first)
-    return num_long_tracks(context.model, viewpoint_of)
+    Pairs from one viewpoint say nothing of the pose; an image without others has a share of 1.
+    """
+    shares = list[float]()
+    weights = list[int]()
+    for pair in context.pairs_of[image_id]:
+        if not context.is_of_one_viewpoint(pair):
+            shares.append(context.agreements[pair.ids])
+            weights.append(len(pair.matches))
+    return float(np.average(shares, weights=weights)) if shares else 1.0
 
 
 def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
@@ -252,13 +256,14 @@ def _direction_sigmas_deg(
 ) -> dict[int, float]:
     """Return how uncertain the directions from each image to others are, with its priors."""
     recorded = context.priors.keys() & context.task.cameras.keys()
-    fixed = frozenset(key for key in recorded if context.task.cameras[key].is_fixed)
+    records = context.task.cameras
+    constant = frozenset(key for key in recorded if records[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions()
     adjuster = Adjuster(
         priors=context.priors,
         noise_px=NOISE_PX,
         refining=refining,
-        constant=fixed,
+        constant=constant,
         tie_points=tie_points,
     )
     return direction_sigmas_deg(context.model, adjuster)
@@ -312,7 +317,7 @@ def _focal_spreads(
     return {size: max(of_size) / min(of_size) for size, of_size in focals_px.items()}
 
 
-def _bridge_edges(context: _ModelContext) -> dict[int, VerifiedPair]:
+def _cut_pairs(context: _ModelContext) -> dict[int, VerifiedPair]:
     """Return the pair without which an image, with others, would be apart from half of all.
 
     Of several such pairs that with fewest inliers counts.

@@ -3,9 +3,11 @@
 What they have in common tells no depth, and neither confirms the pose of the other.
 """
 
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
+from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.parallax import correlation, same_view_homography
 from colmap_affrect.images.reading import read_gray
@@ -39,3 +41,20 @@ def same_viewpoint_pairs(graph: PairGraph, image_path: Path | None) -> frozenset
         if correlation(image1, image2, homography) >= MIN_CORRELATION:
             found.add(pair.ids)
     return frozenset(found)
+
+
+def viewpoints(pairs: Iterable[Ids]) -> dict[int, int]:
+    """Return the viewpoints of images: of each the lowest id of those from the same one.
+
+    Images from the same viewpoint as a third one are from the same viewpoint, too.
+
+    Args:
+        pairs: Pairs from the same viewpoint.
+
+    Returns:
+        By id of the images of these pairs.
+    """
+    viewpoint_of = dict[int, int]()
+    for images in connected_parts(pairs):
+        viewpoint_of |= dict.fromkeys(images, min(images))
+    return viewpoint_of

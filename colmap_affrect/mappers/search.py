@@ -36,7 +36,7 @@ SHARED_SIGMA = 0.1
 SAME_FOCAL = 0.03
 """Largest difference of the logarithms of two focal lengths, of which bridges that were built with
 one are right with the other (judged)."""
-NUM_STARTS = 3  # models from which bridges are built in turn (resource)
+NUM_BRIDGED_MODELS = 3  # models from which bridges are built in turn (resource)
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,13 @@ class Search:
     adjuster: Adjuster
     scorer: ModelScorer
     native: pycolmap.IncrementalPipelineOptions
-    num_seeds: int  # first pairs in a row that may bring nothing
+    max_models_without_gain: int  # in a row, after which no others are grown
     show: Callable[[int], None]  # is told how many images a model has
-    num_starts: int = NUM_STARTS
-    """Models from which bridges are built in turn; with 0 there are none, and one focal length."""
+    num_bridged_models: int = NUM_BRIDGED_MODELS  # from which bridges are built in turn
+    # otherwise images that tracks do not register are left out
+    builds_bridges: bool = True
+    # otherwise models begin with the likeliest focal lengths alone
+    tries_focals: bool = True
 
     @property
     def graph(self) -> PairGraph:
@@ -87,7 +90,8 @@ class Search:
             model = attempt.models[0].reconstruction
             if attempt.score > best.score:
                 best = attempt
-                if search in initial and not attempt.agrees:
+                lacks_bridges = self._lacks_bridges(search, graph, model)
+                if search in initial and (lacks_bridges or not attempt.agrees):
                     pending.insert(0, self._with_focals_of(model))
             if self.is_certain(model, graph, agrees=attempt.agrees):
                 break
@@ -95,6 +99,14 @@ class Search:
         for mapped in best.models:
             grower.adjust_fully(mapped.reconstruction)
         return best.models
+
+    def _lacks_bridges(
+        self, search: Self, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> bool:
+        """Tell whether bridges may improve a model that another search made without them."""
+        if search.builds_bridges or not self.builds_bridges:
+            return False
+        return bool(graph.unexplained_by(model))
 
     def extend_models(
         self, graph: PairGraph, known: Sequence[MappedModel]
@@ -134,14 +146,16 @@ class Search:
         """
         if not models:
             return []
-        if not self.num_starts or not graph.unexplained_by(models[0].reconstruction):
+        if not self.builds_bridges or not graph.unexplained_by(
+            models[0].reconstruction
+        ):
             return [models[0]]
         grower = self.grower(graph)
-        bridges = BridgeFinder(graph, self.native.random_seed)
+        bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
         joined = list[MappedModel]()
-        for mapped in models[: self.num_starts]:
+        for mapped in models[: self.num_bridged_models]:
             joined.append(register_bridges(mapped, bridges, grower, self.scorer))
-        return with_own_images([max(joined, key=self._score), *models])
+        return with_new_images([max(joined, key=self._score), *models])
 
     def is_certain(
         self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
@@ -157,7 +171,7 @@ class Search:
             Whether no pair contradicts it and its focal lengths agree, or tracks of three images
             confirm each image.
         """
-        if not graph.most_connected.issubset(model.reg_image_ids()):
+        if not graph.largest_component.issubset(model.reg_image_ids()):
             return False
         return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(
             model
@@ -216,16 +230,17 @@ class Search:
     def _with_initial_focals(self) -> list[Self]:
         """Return searches with several values of unknown focal lengths, the likeliest first.
 
-        Where no images share a camera, only the first one builds bridges, to save time.
+        Where no images share a camera, only the first one builds bridges, to save time; another
+        one that wins is repeated with bridges.
         """
         numbers = [len(prior.starts_px) for prior in self.unknown.values()]
         searches = [self._with_start(0)]
-        if self.num_starts:
+        if self.tries_focals:
             for number in range(1, max(numbers, default=1)):
                 search = self._with_start(number)
-                searches.append(
-                    search if self._shared else replace(search, num_starts=0)
-                )
+                if not self._shared:
+                    search = replace(search, builds_bridges=False)
+                searches.append(search)
         return searches
 
     def _with_start(self, number: int) -> Self:
@@ -240,7 +255,7 @@ class Search:
                 focal_px=prior.starts_px[min(number, len(prior.starts_px) - 1)],
                 sigma=sigma,
             )
-        return self._with_priors(priors)
+        return self._adjusting_with(priors)
 
     def _with_focals_of(self, model: pycolmap.Reconstruction) -> Self:
         """Return a search that keeps unknown focal lengths near those of a model."""
@@ -249,9 +264,10 @@ class Search:
             priors[key] = replace(
                 self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA
             )
-        return self._with_priors(priors)
+        return self._adjusting_with(priors)
 
-    def _with_priors(self, priors: Mapping[int, CameraPrior]) -> Self:
+    def _adjusting_with(self, priors: Mapping[int, CameraPrior]) -> Self:
+        """Return a search that adjusts with other priors of some cameras, and scores as before."""
         together = {**self.adjuster.priors, **priors}
         return replace(self, adjuster=replace(self.adjuster, priors=together))
 
@@ -288,33 +304,55 @@ class Search:
         self, graph: PairGraph, first: Sequence[VerifiedPair]
     ) -> list[MappedModel]:
         """Return models of different images from first pairs, the highest score first."""
-        models: dict[frozenset[int], MappedModel] = {}
-        scores: dict[frozenset[int], float] = {}
-        best_score = 0.0
-        num_in_vain = 0
-        pairs = first_pairs(first, graph)
-        with closing(
-            _grow_in_order(self.grower(graph), [pair.ids for pair in pairs])
-        ) as grown:
+        best = _BestModels(self.scorer)
+        pairs = [pair.ids for pair in first_pairs(first, graph)]
+        num_failed = 0
+        with closing(_grow_in_order(self.grower(graph), pairs)) as grown:
             for model in grown:
-                score = self.scorer.score(model)
-                num_in_vain = (
-                    0 if score > best_score + MIN_SCORE_GAIN else num_in_vain + 1
-                )
-                best_score = max(best_score, score)
-                images = frozenset(model.reg_image_ids())
-                if images not in models or score > scores[images]:
-                    models[images] = MappedModel(model)
-                    scores[images] = score
-                if num_in_vain >= self.num_seeds:
+                if model is None:
+                    num_failed += 1
+                    if num_failed >= self.native.init_num_trials:
+                        break
+                    continue
+                num_failed = 0
+                best.add(model)
+                if best.num_without_gain >= self.max_models_without_gain:
                     break
-                is_complete = len(images) == len(graph.keypoints)
+                is_complete = model.num_reg_images() == len(graph.keypoints)
                 if is_complete and self.scorer.is_confirmed(model):
                     break
-        return [
-            models[images]
-            for images in sorted(models, key=lambda images: -scores[images])
-        ]
+        return best.ranked()
+
+
+class _BestModels:
+    """The model with the highest score of each set of images that models have."""
+
+    def __init__(self, scorer: ModelScorer) -> None:
+        self.scorer = scorer
+        self.num_without_gain = (
+            0  # models in a row that scored no higher than all before
+        )
+        self._best_score = 0.0
+        self._models: dict[frozenset[int], pycolmap.Reconstruction] = {}
+        self._scores: dict[frozenset[int], float] = {}
+
+    def add(self, model: pycolmap.Reconstruction) -> None:
+        """Take a model, in the place of one of the same images that scores lower."""
+        score = self.scorer.score(model)
+        if score > self._best_score + MIN_SCORE_GAIN:
+            self.num_without_gain = 0
+        else:
+            self.num_without_gain += 1
+        self._best_score = max(self._best_score, score)
+        images = frozenset(model.reg_image_ids())
+        if images not in self._models or score > self._scores[images]:
+            self._models[images] = model
+            self._scores[images] = score
+
+    def ranked(self) -> list[MappedModel]:
+        """Return the models, the highest score first."""
+        ranked = sorted(self._models, key=lambda images: -self._scores[images])
+        return [MappedModel(self._models[images]) for images in ranked]
 
 
 def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[VerifiedPair]:
@@ -332,7 +370,7 @@ def first_pairs(pairs: Iterable[VerifiedPair], graph: PairGraph) -> list[Verifie
     return sorted(pairs, key=order)
 
 
-def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
+def with_new_images(models: Iterable[MappedModel]) -> list[MappedModel]:
     """Leave out models with less than two images that none before has."""
     found = list[MappedModel]()
     inside = set[int]()
@@ -346,7 +384,10 @@ def with_own_images(models: Iterable[MappedModel]) -> list[MappedModel]:
 
 def _grow_in_order(
     grower: Grower, pairs: Sequence[Ids]
-) -> Generator[pycolmap.Reconstruction, None, None]:
-    """Yield models that grow from pairs: in threads after the first, which often is enough."""
-    yield from filter(None, map(grower.grow, pairs[:1]))
-    yield from filter(None, map_ordered(grower.grow, pairs[1:], available_cores()))
+) -> Generator[pycolmap.Reconstruction | None, None, None]:
+    """Yield models that grow from pairs, None of one that makes none.
+
+    They grow in threads after the first, which often is enough.
+    """
+    yield from map(grower.grow, pairs[:1])
+    yield from map_ordered(grower.grow, pairs[1:], available_cores())

@@ -37,7 +37,7 @@ def with_snapshots(
         folder: Of all snapshots; there is one for each task in it.
         num_images: Of the database.
     """
-    # So few images have no two snapshots; sparse.LARGE says how they are mapped
+    # So few images have no two snapshots; sparse.MIN_LARGE_SET says how they are mapped
     if num_images < SNAPSHOT_FRAMES or task.extend:
         yield task
         return

@@ -26,7 +26,7 @@ from colmap_affrect.mappers.principal_points import (
     with_free_principal_points,
     with_shifted_axes,
 )
-from colmap_affrect.mappers.search import Search, with_own_images
+from colmap_affrect.mappers.search import Search, with_new_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
@@ -38,7 +38,7 @@ MEASURED_PAIRS = (
 ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
-OWN_CAMERAS = "with a camera for each photograph"
+PER_IMAGE_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
@@ -48,7 +48,7 @@ FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
 # Images from which on COLMAP's own pipeline maps: the search would take too long; resource
-LARGE = 100
+MIN_LARGE_SET = 100
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,9 @@ class SparseOptions(PipelineOptions):
     noise_px: Annotated[float, within(0.01, 100.0)] = NOISE_PX
     """Standard deviation of keypoints; larger errors count less and less."""
     num_seeds: Annotated[int, within(1, 1000)] = 6  # resource
-    """First pairs in a row that bring nothing, after which no others are tried."""
+    """Models from first pairs in a row that score no higher than those before, after which no
+    others are grown. First pairs that make no model end the search as in COLMAP, after
+    ``init_num_trials`` of them."""
 
 
 class SparseMapper(IncrementalMapper):
@@ -104,14 +106,14 @@ class SparseMapper(IncrementalMapper):
         # Other limits of a hundred images say other things: how many a model has that
         # is looked at closely (focal_observability, direction_uncertainty), and how
         # many come between two snapshots.
-        is_small = len(graph.keypoints) < LARGE and not task.extend
+        is_small = len(graph.keypoints) < MIN_LARGE_SET and not task.extend
         if is_small:
             if FORWARD_MOTION not in self.options.mapper_options:
                 # The score decides on such pairs
                 native.mapper.init_max_forward_motion = 1.0
             return self._map_small(task, graph, native, output_path, show_or_stop)
         search = self._search(task, graph, native, show_or_stop)
-        search = replace(search, num_starts=1)
+        search = replace(search, num_bridged_models=1)
         if task.previous_models:
             found = _restarted(search, task.previous_models)
         else:
@@ -141,7 +143,7 @@ class SparseMapper(IncrementalMapper):
         Images of one size share uncalibrated cameras at first. Cameras of their own are one more
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
-        own = self._search(task, graph, native, show)
+        per_image = self._search(task, graph, native, show)
         bare = replace(task, image_path=None, snapshot_path=None)
         by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
         best = list[MappedModel]()
@@ -149,9 +151,9 @@ class SparseMapper(IncrementalMapper):
         if len(cameras) < len(task.cameras):
             sharing = replace(task, cameras=cameras)
             shared = self._search(sharing, graph.with_cameras(cameras), native, show)
-            best = _HypothesisTest(task, shared, own, by_colmap).run()
+            best = _HypothesisTest(task, shared, per_image, by_colmap).run()
         if not best:
-            best = _HypothesisTest(task, own, None, by_colmap).run()
+            best = _HypothesisTest(task, per_image, None, by_colmap).run()
         for mapped in best:
             if not has_rigs(mapped.reconstruction):  # which tell the scale
                 mapped.reconstruction.normalize()  # as COLMAP does
@@ -232,7 +234,9 @@ class SparseMapper(IncrementalMapper):
         """Return the ids of the cameras of which nothing is refined."""
         constant = set[int]()
         if self.options.keep_given_intrinsics:
-            constant |= {key for key, record in task.cameras.items() if record.is_fixed}
+            constant |= {
+                key for key, record in task.cameras.items() if record.is_all_given
+            }
         refines_others = (
             native.ba_refine_extra_params or native.ba_refine_principal_point
         )
@@ -258,7 +262,7 @@ class _HypothesisTest:
         self,
         task: MappingTask,
         search: Search,
-        own: Search | None,
+        per_image: Search | None,
         by_colmap: Callable[[], list[MappedModel]],
     ) -> None:
         """Begin with the previous models of a task.
@@ -266,13 +270,13 @@ class _HypothesisTest:
         Args:
             task: What to map.
             search: Makes and scores models, with the cameras that images have at first.
-            own: The same with a camera for each image; None if they have these at first.
+            per_image: The same with a camera for each image; None if they have these at first.
             by_colmap: Returns the models that COLMAP's own mapper makes.
         """
         self.task = task
         self.by_colmap = by_colmap
         self.search = search
-        self.own = own
+        self.per_image = per_image
         self._begin_with_cameras_of(task.previous_models)
         self.best = _restarted(self.search, task.previous_models)
         self.score = self.search.best_score(self.best)
@@ -285,8 +289,8 @@ class _HypothesisTest:
             models = self._built(hypothesis)
             score = self.search.best_score(models)
             if models and (not self.best or score > self.score):
-                self._take(hypothesis, models, score)
-                self._try_own_cameras(hypothesis)
+                self._take(models, score)
+                self._try_per_image_cameras(hypothesis)
         if not self._is_certain():
             self._try_colmap()
         self._try_straight_lens()
@@ -311,23 +315,22 @@ class _HypothesisTest:
         return self.search.is_certain(self.best[0].reconstruction, self.search.graph)
 
     def _built(self, hypothesis: _Hypothesis) -> list[MappedModel]:
-        """Return the models of a hypothesis, none where it explains no more than the best ones."""
+        """Return the models of a hypothesis, none where it explains no more than the best ones.
+
+        Models that were known before are adjusted with its pairs, too, so that all of them have
+        its name, each after the hypotheses that made it before.
+        """
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
-            return _of_some_tracks(self.search, graph) or self.search.best(graph)
+            models = _of_some_tracks(self.search, graph) or self.search.best(graph)
+            return _made_by(hypothesis.name, models)
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
-        return self.search.extend_models(graph, self.best)
+        models = self.search.extend_models(graph, self.best)
+        return [_also_by(hypothesis.name, mapped) for mapped in models]
 
-    def _take(
-        self, hypothesis: _Hypothesis, models: Sequence[MappedModel], score: float
-    ) -> None:
-        is_new = hypothesis.name == COLMAP_MODEL
-        before = self.best[0].hypotheses if self.best and not is_new else ()
-        hypotheses = _without_duplicates(
-            (*before, hypothesis.name, *models[0].hypotheses)
-        )
-        self.best = [replace(mapped, hypotheses=hypotheses) for mapped in models]
+    def _take(self, models: Sequence[MappedModel], score: float) -> None:
+        self.best = list(models)
         self.score = score
 
     def _try_colmap(self) -> None:
@@ -349,16 +352,16 @@ class _HypothesisTest:
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
-            self._take(_Hypothesis(COLMAP_MODEL, ()), found, score)
+            self._take(_made_by(COLMAP_MODEL, found), score)
 
     def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
         """Go on with the cameras, and the optical axes, that models had."""
         told = set[str]()
         for mapped in models:
             told.update(mapped.hypotheses)
-        if self.own and not told.isdisjoint({OWN_CAMERAS, SHIFTED_AXES}):
-            self.search = self.own
-            self.own = None
+        if self.per_image and not told.isdisjoint({PER_IMAGE_CAMERAS, SHIFTED_AXES}):
+            self.search = self.per_image
+            self.per_image = None
         if SHIFTED_AXES in told:
             free = with_free_principal_points(self.search, self.task.cameras)
             self.search = free or self.search
@@ -381,33 +384,38 @@ class _HypothesisTest:
         if free is None or not contradict_held(model, search, free):
             return
         changed = with_shifted_axes(model, free, search.graph)
-        changed_model = replace(self.best[0], reconstruction=changed)
+        changed_model = _also_by(
+            SHIFTED_AXES, replace(self.best[0], reconstruction=changed)
+        )
         found = free.with_bridges(search.graph, [changed_model])
-        found = with_own_images([*found, *self.best[1:]])
+        found = with_new_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         paid = principal_point_cost(found[0].reconstruction, free)  # by the points
         if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
-            self._take(_Hypothesis(SHIFTED_AXES, ()), found, score)
+            self._take(found, score)
             return
         turns_deg = axis_turns_deg(model, free, search.graph)
         self.best = [replace(self.best[0], axis_turns_deg=turns_deg), *self.best[1:]]
 
-    def _try_own_cameras(self, hypothesis: _Hypothesis) -> None:
+    def _try_per_image_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""
-        if self.own is None:
+        if self.per_image is None:
             return
         first = self.best[0]
-        graph = self.own.graph.without(hypothesis.left_out)
-        model = _with_own_cameras(self.own, graph, self.search, first.reconstruction)
-        if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
-            return
-        changed = replace(
-            first, reconstruction=model, hypotheses=(*first.hypotheses, OWN_CAMERAS)
+        graph = self.per_image.graph.without(hypothesis.left_out)
+        model = _with_per_image_cameras(
+            self.per_image, graph, self.search, first.reconstruction
         )
-        self.best = with_own_images([changed, *self.best[1:]])
-        self.search = self.own
-        self.own = None
+        if (
+            model is None
+            or self.per_image.scorer.score(model) <= self.score + MIN_SCORE_GAIN
+        ):
+            return
+        changed = _also_by(PER_IMAGE_CAMERAS, replace(first, reconstruction=model))
+        self.best = with_new_images([changed, *self.best[1:]])
+        self.search = self.per_image
+        self.per_image = None
         self.score = self.search.best_score(self.best)
 
 
@@ -427,8 +435,19 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _without_duplicates(hypotheses: Sequence[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(hypotheses))
+def _made_by(name: str, models: Sequence[MappedModel]) -> list[MappedModel]:
+    """Return models with the name of a hypothesis before those that each of them has."""
+    found = list[MappedModel]()
+    for mapped in models:
+        hypotheses = tuple(dict.fromkeys((name, *mapped.hypotheses)))
+        found.append(replace(mapped, hypotheses=hypotheses))
+    return found
+
+
+def _also_by(name: str, mapped: MappedModel) -> MappedModel:
+    """Return a model with the name of a hypothesis after those that it has."""
+    hypotheses = tuple(dict.fromkeys((*mapped.hypotheses, name)))
+    return replace(mapped, hypotheses=hypotheses)
 
 
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
@@ -437,18 +456,17 @@ def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedMo
     found = list[MappedModel]()
     for mapped in previous:
         model = grower.remake(mapped.reconstruction)
-        hypotheses = _without_duplicates((*mapped.hypotheses, AGAIN))
-        found.append(replace(mapped, reconstruction=model, hypotheses=hypotheses))
-    return with_own_images(found)
+        found.append(_also_by(AGAIN, replace(mapped, reconstruction=model)))
+    return with_new_images(found)
 
 
-def _with_own_cameras(
-    own: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
+def _with_per_image_cameras(
+    per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction | None:
     """Return a model with a camera for each image.
 
     Args:
-        own: Makes the model.
+        per_image: Makes the model.
         graph: Its pairs.
         shared: Scores the model with shared cameras.
         model: The model with shared cameras.
@@ -458,12 +476,12 @@ def _with_own_cameras(
     """
     thin = graph.thinned()
     if thin is not graph:
-        trial = own.grower(thin).restart_from(model)
-        own_score = replace(own.scorer, graph=thin).score(trial)
+        trial = per_image.grower(thin).restart_from(model)
+        per_image_score = replace(per_image.scorer, graph=thin).score(trial)
         shared_score = replace(shared.scorer, graph=thin).score(model)
-        if own_score <= shared_score + MIN_SCORE_GAIN:
+        if per_image_score <= shared_score + MIN_SCORE_GAIN:
             return None
-    return own.grower(graph).remake(model)
+    return per_image.grower(graph).remake(model)
 
 
 def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
@@ -472,7 +490,7 @@ def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     if thin is graph:
         return []
     scorer = replace(search.scorer, graph=thin)
-    quick = replace(search, scorer=scorer, num_starts=0)
+    quick = replace(search, scorer=scorer, builds_bridges=False, tries_focals=False)
     models = quick.best(thin)
     if not models:
         return []

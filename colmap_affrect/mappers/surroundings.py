@@ -18,10 +18,15 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.model_score import CHANCE, RIGHT_PAIR, beta_log_ratio
+from colmap_affrect.mappers.model_score import (
+    CHANCE,
+    GRID,
+    RIGHT_PAIR,
+    beta_log_ratio,
+    grid_cells,
+)
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
 
-GRID = 8  # cells on a side of a photograph; same as of scores (model_score)
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
 MAX_ANGLE_DEG = 40.0
 """Between the rays of two photographs to a point: beyond, matching loses much (judged)."""
@@ -29,7 +34,7 @@ MAX_ZOOM = 2.2  # ratio of scales, beyond which the same is true (judged)
 # Times the depth of a surface before a point, which is hidden then; judged
 HIDDEN = 1.15
 # Of the longer side: surfaces of a photograph are known so far from its points; judged
-NEIGHBOR_RADIUS = 0.06
+SURFACE_RADIUS = 0.06
 NUM_NEIGHBORS = 3  # whose median depth is that of the surface; theory
 MAX_NUM_POINTS = 500  # of a photograph that are looked at; resource
 MAX_NUM_PAIRS = 1000  # of a model: larger ones are not looked at; resource
@@ -80,11 +85,11 @@ class _Views:
         if image_id not in self._seen:
             observed = self.model.images[image_id].get_observation_points2D()
             kept = observed[:: sampling_step(len(observed), MAX_NUM_POINTS)]
-            places = np.array([mark.xy for mark in kept]).reshape(-1, 2)
+            points_px = np.array([mark.xy for mark in kept]).reshape(-1, 2)
             ids = np.array([mark.point3D_id for mark in kept], np.int64)
             points = [self.model.points3D[mark.point3D_id].xyz for mark in kept]
             positions = np.array(points).reshape(-1, 3)
-            self._seen[image_id] = places, ids, positions
+            self._seen[image_id] = points_px, ids, positions
         return self._seen[image_id]
 
     def observes(self, image_id: int, ids: Indices) -> Bools:
@@ -111,9 +116,9 @@ class _Views:
             first: Other images.
             second: Others.
         """
-        places, ids, _ = self.seen(image_id)
+        points_px, ids, _ = self.seen(image_id)
         camera = self.model.cameras[self.model.images[image_id].camera_id]
-        cells = (places / [camera.width, camera.height] * GRID).astype(int) @ [1, GRID]
+        cells = grid_cells(camera, points_px)
         regions = []
         for side in (first, second):
             is_shared = np.zeros(len(ids), bool)
@@ -132,16 +137,16 @@ class _Views:
         camera = self.model.cameras[self.model.images[target].camera_id]
         pose = self.model.images[target].cam_from_world().matrix()
         local = positions @ pose[:, :3].T + pose[:, 3]
-        places = _projected(camera, local)
-        is_inside = (places >= 0).all(axis=1)
-        is_inside &= (places < [camera.width, camera.height]).all(axis=1)
+        points_px = _projected(camera, local)
+        is_inside = (points_px >= 0).all(axis=1)
+        is_inside &= (points_px < [camera.width, camera.height]).all(axis=1)
         is_expected = is_inside & self._looks_alike(source, target, positions)
         is_found = self.observes(target, ids)
         open_rows = np.flatnonzero(is_expected & ~is_found)
-        is_hidden = self._is_hidden(target, places[open_rows], local[open_rows, 2])
+        is_hidden = self._is_hidden(target, points_px[open_rows], local[open_rows, 2])
         is_expected[open_rows[is_hidden]] = False
-        cells = (places[is_expected] / [camera.width, camera.height] * GRID).astype(int)
-        return _counted(cells @ [1, GRID], is_found[is_expected])
+        cells = grid_cells(camera, points_px[is_expected])
+        return _counted(cells, is_found[is_expected])
 
     def _looks_alike(self, source: int, target: int, positions: Array) -> Bools:
         """Tell which positions two images see from similar directions and at similar scales."""
@@ -161,24 +166,24 @@ class _Views:
         is_near = cosines > np.cos(np.radians(MAX_ANGLE_DEG))
         return np.asarray(is_near & (zooms < np.log(MAX_ZOOM)))
 
-    def _is_hidden(self, image_id: int, places: Array, depths: Array) -> Bools:
+    def _is_hidden(self, image_id: int, points_px: Array, depths: Array) -> Bools:
         """Tell which points lie behind a surface that an image sees.
 
         Args:
             image_id: Of the image.
-            places: (N, 2) px where it would see them.
+            points_px: (N, 2) px where it would see them.
             depths: (N,) in its camera.
         """
         own, _, positions = self.seen(image_id)
         if len(own) < NUM_NEIGHBORS:
-            return np.zeros(len(places), bool)
+            return np.zeros(len(points_px), bool)
         image = self.model.images[image_id]
         pose = image.cam_from_world().matrix()
         own_depths = positions @ pose[2, :3] + pose[2, 3]
         camera = self.model.cameras[image.camera_id]
-        radius_px = NEIGHBOR_RADIUS * max(camera.width, camera.height)
-        across = places[:, :1] - own[:, 0]
-        down = places[:, 1:] - own[:, 1]
+        radius_px = SURFACE_RADIUS * max(camera.width, camera.height)
+        across = points_px[:, :1] - own[:, 0]
+        down = points_px[:, 1:] - own[:, 1]
         distances = np.hypot(across, down)
         nearest = np.argpartition(distances, NUM_NEIGHBORS - 1, axis=1)
         nearest = nearest[:, :NUM_NEIGHBORS]
@@ -190,12 +195,12 @@ class _Views:
 
 def _projected(camera: pycolmap.Camera, local: Array) -> Array:
     """Return the (N, 2) px of (N, 3) points, -1 of those behind the camera."""
-    places = np.full((len(local), 2), -1.0)
+    points_px = np.full((len(local), 2), -1.0)
     is_before = local[:, 2] > 0
     if is_before.any():
         projected = np.asarray(camera.img_from_cam(local[is_before]), np.float64)
-        places[is_before] = np.where(np.isfinite(projected), projected, -1.0)
-    return places
+        points_px[is_before] = np.where(np.isfinite(projected), projected, -1.0)
+    return points_px
 
 
 def _counted(cells: Indices, is_found: Bools) -> Overlap:

@@ -131,7 +131,8 @@ class TieJoiner:
             cameras: Of both.
 
         Returns:
-            The pose, with a translation of length 1; None where most marks agree with none.
+            The pose, with a translation of length 1; None where too few
+            marks agree with one.
         """
         options = self._ransac(AGREEING_PX)
         found: Any = pycolmap.estimate_essential_matrix(
@@ -152,7 +153,9 @@ class TieJoiner:
             else (*mapped.hypotheses, BY_HAND)
         )
         registered = replace(mapped, reconstruction=model, hypotheses=hypotheses)
-        bridges = BridgeFinder(self.grower.graph, self.grower.native.random_seed)
+        grower = self.grower
+        seed = grower.native.random_seed
+        bridges = BridgeFinder(grower.graph, grower.adjuster, seed)
         return register_bridges(registered, bridges, self.grower, self.scorer)
 
     def _next_images(

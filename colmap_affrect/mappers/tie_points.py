@@ -31,7 +31,7 @@ MAX_LOG_ODDS = 2.5
 thirteen are right."""
 NUM_FREE = 3  # tie points with which any pose of an image can agree (P3P); theory
 # A tie point that one image alone sees has the median depth of the points near its mark (judged).
-NEIGHBOR_RADIUS = 0.1  # of the longer side of the image
+MARK_RADIUS = 0.1  # of the longer side of the image
 NUM_NEIGHBORS = 5  # judged
 # Of an image, among which neighbours are looked for, to save time; resource
 MAX_NUM_OBSERVED = 2_000
@@ -151,7 +151,7 @@ class TiePoints:
         return found
 
 
-NONE = TiePoints({})
+NO_TIE_POINTS = TiePoints({})
 
 
 def tie_point_log_odds(residuals: Sequence[ImageResidual]) -> dict[int, float]:
@@ -249,7 +249,7 @@ def _max_mark_error_px(
 class _Observed:
     """Points that an image sees."""
 
-    places: Array  # (N, 2) px
+    points_px: Array  # (N, 2)
     depths: Array  # (N,)
 
 
@@ -268,13 +268,13 @@ class _Surroundings:
         if image_id not in self._observed:
             self._observed[image_id] = self._observed_by(image_id)
         observed = self._observed[image_id]
-        distances = np.linalg.norm(observed.places - xy, axis=1)
+        distances = np.linalg.norm(observed.points_px - xy, axis=1)
         nearest = np.argsort(distances)[:NUM_NEIGHBORS]
         if len(nearest) < NUM_NEIGHBORS:
             return None
         image = self.model.images[image_id]
         camera = self.model.cameras[image.camera_id]
-        if distances[nearest[-1]] > NEIGHBOR_RADIUS * max(camera.width, camera.height):
+        if distances[nearest[-1]] > MARK_RADIUS * max(camera.width, camera.height):
             return None
         depth = np.median(observed.depths[nearest])
         ray = np.append(np.asarray(camera.cam_from_img(xy)).ravel(), 1.0)
@@ -285,9 +285,9 @@ class _Surroundings:
         seen = image.get_observation_points2D()
         step = sampling_step(len(seen), MAX_NUM_OBSERVED)
         pose = image.cam_from_world()
-        places = list[Array]()
+        points_px = list[Array]()
         depths = list[float]()
         for point in seen[::step]:
-            places.append(point.xy)
+            points_px.append(point.xy)
             depths.append((pose * self.model.points3D[point.point3D_id].xyz)[2])
-        return _Observed(np.array(places).reshape(-1, 2), np.array(depths))
+        return _Observed(np.array(points_px).reshape(-1, 2), np.array(depths))

@@ -82,7 +82,7 @@ def _contradiction_notes(
 def merge_shared_cameras(
     cameras: Sequence[Mapping[str, Any]],
 ) -> list[Mapping[str, Any]]:
-    """Return cameras, with those that mapping has made one as one, with all their photographs.
+    """Return cameras, with those that mapping has made one as the first, with all photographs.
 
     Args:
         cameras: entries of ``report.json``.
@@ -92,10 +92,12 @@ def merge_shared_cameras(
         key: object = number
         if _is_estimated(camera):
             key = (camera["refined_px"], camera["focal_px"], camera["why"])
-        names = camera["names"]
-        if key in merged:
-            names = [*merged[key]["names"], *names]
-        merged[key] = {**camera, "names": names}
+        first = merged.get(key)
+        if first is None:
+            merged[key] = camera
+        else:
+            names = [*first["names"], *camera["names"]]
+            merged[key] = {**first, "names": names, "num_images": len(names)}
     return list(merged.values())
 
 

@@ -103,7 +103,7 @@ def read_view(
         return View3D(note=f"The model cannot be shown: {error}")
     upright = upright_of_run(path, model)
     fit_upright(model, None if upright is None else upright.direction)
-    return replace(_view(model, max_num_observations), kinds=kinds)
+    return replace(view_of(model, max_num_observations), kinds=kinds)
 
 
 def fit_upright(model: pycolmap.Reconstruction, up: Floats | None = None) -> None:
@@ -149,8 +149,13 @@ def _poses(model: pycolmap.Reconstruction) -> tuple[Array, Array]:
     return axes.reshape(-1, 3, 3), centers.reshape(-1, 3)
 
 
-def _view(model: pycolmap.Reconstruction, max_num_observations: int) -> View3D:
-    """Return a model that was turned upright as the page has it."""
+def view_of(model: pycolmap.Reconstruction, max_num_observations: int = 0) -> View3D:
+    """Return a model that was turned upright as the page has it.
+
+    Args:
+        model: inside of a sphere of radius 1 about 0, see :func:`fit_upright`.
+        max_num_observations: see :func:`read_view`.
+    """
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     if len(ids) > MAX_NUM_POINTS:
         ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)

@@ -1,6 +1,7 @@
 """What a run has stored goes into the database: images, cameras, keypoints and raw matches."""
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ from colmap_affrect.pairs.lists import Pair, PairList
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.session.view_graph import ViewGraph
+
+# In one transaction: a run that is ended writes at most as many again; resource
+PAIRS_PER_WRITE = 100
 
 
 def start_database(workspace: Workspace, inputs: Inputs) -> None:
@@ -104,6 +108,8 @@ def write_matches(
 ) -> None:
     """Put the raw matches that the database lacks into it; it has images and keypoints.
 
+    They are written in batches: a run that is killed loses one, and writes it when it is repeated.
+
     Args:
         context: of the workspace.
         database: that of the workspace, open.
@@ -120,6 +126,13 @@ def write_matches(
     todo = listed.at(wanted)
     if not todo:
         return
-    for found in context.matches.read(todo):
-        first, second = found.names
-        colmap_database.write_matches(database, ids[first], ids[second], found.indices)
+    stored = context.matches.read(todo)
+    batch = list(islice(stored, PAIRS_PER_WRITE))
+    while batch:
+        with pycolmap.DatabaseTransaction(database):
+            for found in batch:
+                first, second = found.names
+                colmap_database.write_matches(
+                    database, ids[first], ids[second], found.indices
+                )
+        batch = list(islice(stored, PAIRS_PER_WRITE))

@@ -9,6 +9,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
+from colmap_affrect.colmap.verification import verify
 from colmap_affrect.errors import ConflictError
 from colmap_affrect.geometry.lines import LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -22,6 +23,7 @@ from colmap_affrect.project.record import OWN, ModelInputs
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
+from colmap_affrect.stages.verify import extracted_px
 
 # Pairs that are named for each image that was not registered; display
 NUM_BEST_PAIRS = 3
@@ -105,6 +107,9 @@ def _task(
     if by_hand != NOTHING:
         path = workspace.mapped_database
         tie_points = by_hand.copy_database(workspace.database, path)
+    if by_hand.masks_path:  # pairs that lost matches have no geometry any more
+        sizes_px = None if copied else extracted_px(context)
+        verify(path, context.verification, sizes_px)
     return MappingTask(
         path,
         workspace.photographs(),

@@ -143,8 +143,9 @@ def _match_missing(
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
     with context.progress.stage("match, all features", len(wanted), "pairs") as advance:
-        if not _is_in_vain(context, wanted, options, digest):
-            match_pairs(context, wanted, options, advance)
+        left = _worth_all_features(context, wanted, options, digest)
+        advance(len(wanted) - len(left))
+        match_pairs(context, left, options, advance)
     warnings = dict[str, str]()
     has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
@@ -217,21 +218,37 @@ def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
     ]
 
 
-def _is_in_vain(
+def _worth_all_features(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, digest: str
-) -> bool:
-    """Tell whether all features tie pairs no better than some, by a sample where pairs are many."""
+) -> list[Pair]:
+    """Return the pairs that are still to be matched by all features.
+
+    None where a sample of many says that these tie pairs no better than some; otherwise the
+    matches of the sample are stored.
+
+    Args:
+        context: of the workspace, where the pairs were matched by some of their features.
+        pairs: of image names, that these tie not well.
+        options: of the matcher.
+        digest: of the list of all pairs, for which the answer is kept on record.
+    """
     matches = context.matches
     known = matches.state.in_vain
     is_known = known is not None and known[0] == digest
+    sample: Sequence[Pair] = []
     if not is_known and len(pairs) > NUM_TRIED:
         sample = pairs[:: math.ceil(len(pairs) / NUM_TRIED)]
         with closing(matched_at_level(context, sample, options, 0)) as found:
-            num_after = _sum_confirming(context.features, found)
+            by_all = list(found)
+        num_after = _sum_confirming(context.features, by_all)
         num_before = _sum_confirming(context.features, matches.read(sample))
-        known = (digest, num_after < MIN_GROWTH * num_before)
-        matches.update_state(in_vain=known)
-    return known == (digest, True)
+        is_in_vain = num_after < MIN_GROWTH * num_before
+        known = (digest, is_in_vain)
+        matches.choose([] if is_in_vain else by_all, {}, in_vain=known)
+    if known == (digest, True):
+        return []
+    done = set(sample)
+    return [pair for pair in pairs if pair not in done]
 
 
 def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:

@@ -50,8 +50,8 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    result = tmp_path / "whole.json"
-    diagram = tmp_path / "whole.png"
+    result = tmp_path / "new" / "whole.json"
+    diagram = tmp_path / "drawn" / "whole.png"
     given = ["--scenes-path", "sample_scenes", "--sets", "courtyard:3"]
     given += ["--peers", "sift-colmap", "rectified", "--num-rounds", "1"]
     written = ["--output-path", result, "--diagram-path", diagram]
@@ -62,6 +62,26 @@ def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
         assert 0.0 < sum(run["stages_s"].values()) < run["wall_s"]
     assert "| courtyard:3 | 3 | rectified | " in text
     assert diagram.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (["--sets", "court"], "--sets court: no folder court/images"),
+        (["--sets", "courtyard:0"], "STEP is 1 or more, as in courtyard:2"),
+        (["--sets", "courtyard", "--peers", "rectifid"], "did you mean 'rectified'"),
+        (["--sets", "courtyard", "--num-rounds", "0"], "--num-rounds: give 1 or more"),
+    ],
+)
+def test_whole_runs_that_cannot_end_well_do_not_begin(
+    tmp_path: Path, given: list[str], why: str
+) -> None:
+    where = ["--scenes-path", "sample_scenes", "--output-path", tmp_path / "a.json"]
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        run_script("tests/benchmarks/whole_run.py", *where, *given)
+    assert why in failed.value.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["crop", "shift", "whole"])

@@ -25,6 +25,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -33,7 +34,9 @@ from machine import describe_machine, parser_of, span, table
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.results import pose_scores
+from colmap_affrect.errors import OptionError
 from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.recipes import load_recipe
 
 SIFT = "sift-colmap"
 TRUTHS = ("ground_truth", "pseudo_ground_truth")
@@ -276,6 +279,35 @@ def keep_to_cores(number: int) -> None:
     os.sched_setaffinity(0, cores)
 
 
+def check(arguments: Namespace) -> None:
+    """Find what would end the runs or lose their results before the first of them begins."""
+    if not (arguments.scenes_path and arguments.sets):
+        raise SystemExit("give --scenes-path and --sets")
+    if arguments.num_rounds < 1:
+        raise SystemExit("--num-rounds: give 1 or more")
+    for text in arguments.sets:
+        check_set(text, arguments.scenes_path)
+    for peer in set(arguments.peers) - {SIFT}:
+        try:
+            load_recipe(peer)
+        except OptionError as error:
+            raise SystemExit(f"--peers: {error}") from error
+    if arguments.diagram_path and not find_spec("matplotlib"):
+        raise SystemExit("--diagram-path: needs matplotlib; pip install matplotlib")
+    for path in (arguments.output_path, arguments.diagram_path):
+        if path:
+            path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def check_set(text: str, scenes_path: Path) -> None:
+    """Refuse what is no SCENE or SCENE:STEP."""
+    scene, colon, step = text.partition(":")
+    if not (scenes_path / scene / "images").is_dir():
+        raise SystemExit(f"--sets {text}: no folder {scene}/images in --scenes-path")
+    if colon and not (step.isdecimal() and int(step)):
+        raise SystemExit(f"--sets {text}: STEP is 1 or more, as in {scene}:2")
+
+
 def parsed_arguments() -> Namespace:
     """Return what the command line says."""
     parser = parser_of(__doc__)
@@ -304,8 +336,7 @@ def main() -> None:
     if arguments.sift_only:
         run_sift(arguments.sift_only, arguments.output_path)
         return
-    if not (arguments.scenes_path and arguments.sets):
-        raise SystemExit("give --scenes-path and --sets")
+    check(arguments)
     if arguments.num_cores:
         keep_to_cores(arguments.num_cores)
     sets = [read_set(text, arguments.scenes_path) for text in arguments.sets]

@@ -52,8 +52,8 @@ def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
 def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
     parser = build_parser()
     assert {example.split()[0] for example in EXAMPLES} == {
-        *COMMANDS, "convert", "panoramas", "show-pair", "lines", "import-h5", "export-h5",
-        "export-database", "export", "align",
+        *COMMANDS, "convert", "panoramas", "serve", "show-pair", "show-runs", "lines",
+        "import-h5", "export-h5", "export-database", "export", "align",
     }  # fmt: skip
     for example in EXAMPLES:
         parser.parse_args(example.replace("\\\n", " ").split())

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_tasks import write_images
+from small_comparison import IMAGE_SIZE, write_scene
+from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand, read_marks, triangulated
@@ -173,3 +175,43 @@ def test_marks_are_triangulated_where_they_are_in_space() -> None:
     found = triangulated(model, marks)
     assert found is not None
     np.testing.assert_allclose(found, place, atol=1e-9)
+
+
+def test_matches_below_a_painted_mask_are_left_out_and_verified_anew(
+    tmp_path: Path,
+) -> None:
+    names = ["a.png", "b.png", "c.png"]
+    write_scene(tmp_path / "all.db", names)
+    (tmp_path / "masks").mkdir()
+    mask = np.full((IMAGE_SIZE[1], IMAGE_SIZE[0]), 255, np.uint8)
+    mask[:, : IMAGE_SIZE[0] // 2] = 0
+    write_image(tmp_path / "masks" / "a.png.png", mask)
+    by_hand = ByHand(masks_path=tmp_path / "masks")
+    by_hand.copy_database(tmp_path / "all.db", tmp_path / "mapped.db")
+    num_kept = {}
+    with (
+        open_database(tmp_path / "all.db") as before,
+        open_database(tmp_path / "mapped.db") as after,
+    ):
+        ids = {image.name: image.image_id for image in before.read_all_images()}
+        keypoints = before.read_keypoints(ids["a.png"])
+        for first, second in (
+            ("a.png", "b.png"),
+            ("a.png", "c.png"),
+            ("b.png", "c.png"),
+        ):
+            pair = (ids[first], ids[second])
+            known = before.read_two_view_geometry(*pair).inlier_matches
+            if first == "a.png":
+                assert not after.exists_two_view_geometry(*pair)
+                kept = after.read_matches(*pair)
+                is_right = keypoints[known[:, 0], 0] >= IMAGE_SIZE[0] // 2
+                assert {*map(tuple, kept)} == {*map(tuple, known[is_right])}
+                num_kept[pair] = len(kept)
+            else:
+                now = after.read_two_view_geometry(*pair).inlier_matches
+                assert np.array_equal(now, known)
+    assert all(num_kept.values())
+    digest = by_hand.digest()
+    write_image(tmp_path / "masks" / "a.png.png", 255 - mask)
+    assert by_hand.digest() != digest

@@ -147,7 +147,7 @@ def test_what_is_given_stays_and_the_rest_is_as_it_would_be(
     )
     assert record.given == given
     assert record.source == ("given" if "focal" in record.given else "exif")
-    assert record.is_fixed == ("distortion" in record.given)
+    assert record.is_all_given == ("distortion" in record.given)
 
 
 def test_lens_and_film_stand_where_nothing_else_is_known(photos: Path) -> None:

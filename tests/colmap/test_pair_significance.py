@@ -304,22 +304,29 @@ def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
         assert len(accepted.inlier_matches) >= 40
 
 
-def trials_for(
+def search_for(
     frames: Frames, monkeypatch: pytest.MonkeyPatch, columns: int = 6, **options: float
-) -> int:
-    """Most trials that COLMAP is asked for to verify a pair."""
-    asked = list[int]()
+) -> pycolmap.RANSACOptions:
+    """What COLMAP is asked for to verify a pair."""
+    asked = list[pycolmap.RANSACOptions]()
 
     def without_trials(*given: object) -> pycolmap.TwoViewGeometry:
         search = given[-1]
         assert isinstance(search, pycolmap.TwoViewGeometryOptions)
-        asked.append(search.ransac.max_num_trials)
+        asked.append(search.ransac)
         return pycolmap.TwoViewGeometry()
 
     monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", without_trials)
     num_inliers(frames, columns, **options)
-    (num_trials,) = asked
-    return num_trials
+    (search,) = asked
+    return search
+
+
+def trials_for(
+    frames: Frames, monkeypatch: pytest.MonkeyPatch, columns: int = 6, **options: float
+) -> int:
+    """Most trials that COLMAP is asked for to verify a pair."""
+    return search_for(frames, monkeypatch, columns, **options).max_num_trials
 
 
 def some_right_matches(num: int, num_wrong: int, seed: int = 0) -> Frames:
@@ -340,9 +347,13 @@ def test_pairs_without_anything_in_common_are_not_searched_for_long(
     usual = VerificationOptions().max_num_trials
     for seed in range(0, 30, 10):
         nothing = some_right_matches(0, 70, seed)
-        assert trials_for(nothing, monkeypatch) == usual // 10
+        assert trials_for(nothing, monkeypatch) == usual // 100
         something = some_right_matches(20, 50, seed)
         assert trials_for(something, monkeypatch) == usual
+    # one of these agrees with its neighbours, and three
+    for num_right in (7, 12):
+        little = some_right_matches(num_right, 70 - num_right)
+        assert trials_for(little, monkeypatch) == usual // 10
 
 
 def test_the_search_is_as_long_as_asked_where_neighbours_say_nothing(
@@ -354,4 +365,28 @@ def test_the_search_is_as_long_as_asked_where_neighbours_say_nothing(
     assert trials_for(nothing, monkeypatch, min_significance=0.0) == usual
     assert trials_for(nothing, monkeypatch, max_num_trials=50) == 50
     assert trials_for(some_right_matches(0, 310), monkeypatch) == usual
-    assert trials_for(some_right_matches(0, 290), monkeypatch) == usual // 10
+    assert trials_for(some_right_matches(0, 290), monkeypatch) <= usual // 10
+
+
+def test_the_search_ends_when_its_confidence_is_reached(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def asked(num_matches: int, **options: float) -> tuple[float, float]:
+        frames = some_right_matches(num_matches, 0)
+        search = search_for(frames, monkeypatch, **options)
+        return search.dyn_num_trials_multiplier, search.min_inlier_ratio
+
+    # 15 inliers make a verified pair
+    assert asked(50) == (1.0, 0.3)
+    assert asked(20) == (1.0, 0.5)
+    assert asked(400) == (1.0, 0.1)
+    assert asked(50, ransac_min_inlier_ratio=0.4) == (1.0, 0.4)
+    assert asked(50, min_num_inliers=20) == (1.0, 0.4)
+    # what COLMAP accepts is looked for as COLMAP does
+    assert asked(50, min_significance=0.0) == (3.0, 0.1)
+
+
+def test_pairs_of_which_a_third_are_inliers_are_verified_with_all_of_them() -> None:
+    for seed in range(0, 20, 10):
+        frames = some_right_matches(30, 60, seed)
+        assert num_inliers(frames) >= 28

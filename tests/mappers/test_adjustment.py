@@ -84,7 +84,7 @@ def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
     for factor in (0.4, 0.8, 1.0, 2.5):
         prior = CameraPrior(TRUE_FOCAL / factor, 0.3, usual_principal_point(camera))
         camera.params = [TRUE_FOCAL, SIZE[0] / 2 + 9.0, SIZE[1] / 2 - 5.0, 0.0]
-        cost = IntrinsicsCost(camera, prior, 0.5, fixed=[])
+        cost = IntrinsicsCost(camera, prior, 0.5, constant=[])
         residuals = np.zeros(4)
         jacobian = np.zeros(16)
         assert cost.Evaluate([camera.params], residuals, [jacobian])

@@ -58,7 +58,7 @@ def scale_of(poses: dict[int, Pose], first: int, second: int) -> float:
 def test_bridge_begins_at_the_first_or_at_the_second_image_of_a_pair(
     grower: Grower, middle: pycolmap.Reconstruction, image_id: int, neighbor: int
 ) -> None:
-    found = BridgeFinder(grower.graph, SEED).find(middle)
+    found = BridgeFinder(grower.graph, grower.adjuster, SEED).find(middle)
     best = next(hypothesis for hypothesis in found if hypothesis.image_id == image_id)
     assert best.bridge.by == grower.graph.names[neighbor]
     poses = {**poses_of(middle), image_id: best.pose}
@@ -84,7 +84,7 @@ def keep_points(
 
 
 def bridged(grower: Grower, model: pycolmap.Reconstruction) -> set[int]:
-    found = BridgeFinder(grower.graph, SEED).find(model)
+    found = BridgeFinder(grower.graph, grower.adjuster, SEED).find(model)
     return {hypothesis.image_id for hypothesis in found}
 
 

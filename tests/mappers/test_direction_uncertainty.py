@@ -123,5 +123,5 @@ def test_two_images_and_very_many_are_not_looked_at(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert not direction_sigmas_deg(model_of(FAR[:2]), adjuster(0.3))
-    monkeypatch.setattr(direction_uncertainty, "MAX_NUM_IMAGES", 3)
+    monkeypatch.setattr(direction_uncertainty, "MAX_COVARIANCE_IMAGES", 3)
     assert not direction_sigmas_deg(model_of(FAR), adjuster(0.3))

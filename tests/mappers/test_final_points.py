@@ -17,7 +17,7 @@ from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import score_images
-from colmap_affrect.mappers.tie_points import NONE, TiePoints
+from colmap_affrect.mappers.tie_points import NO_TIE_POINTS, TiePoints
 from colmap_affrect.project.report import kept_probability
 
 NOISE_PX = 0.5
@@ -32,11 +32,18 @@ def placed(path: Path) -> pycolmap.Reconstruction:
 
 
 def complete(
-    model: pycolmap.Reconstruction, path: Path, tie_points: TiePoints = NONE
+    model: pycolmap.Reconstruction,
+    path: Path,
+    tie_points: TiePoints = NO_TIE_POINTS,
+    *,
+    all_weak: bool = False,
 ) -> None:
     native = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     native.triangulation.ignore_two_view_tracks = False
-    complete_points(model, PairGraph.read(path), native, NOISE_PX, tie_points)
+    graph = PairGraph.read(path)
+    if all_weak:
+        graph = replace(graph, pairs=(), weak=graph.pairs)
+    complete_points(model, graph, native, NOISE_PX, tie_points)
 
 
 def bits(model: pycolmap.Reconstruction) -> list[bytes]:
@@ -101,7 +108,11 @@ def test_points_that_stood_badly_are_moved(tmp_path: Path) -> None:
     assert model.compute_mean_reprojection_error() == pytest.approx(least, rel=0.01)
 
 
-def test_pair_that_contradicts_the_model_makes_no_points(tmp_path: Path) -> None:
+@pytest.mark.parametrize("all_weak", [False, True])
+def test_pair_that_contradicts_the_model_makes_no_points(
+    tmp_path: Path, *, all_weak: bool
+) -> None:
+    """Neither does one that is not among the strongest of its images."""
     path = tmp_path / "database.db"
     model = placed(path)
     first, second = sorted(model.reg_image_ids())[:2]
@@ -115,7 +126,7 @@ def test_pair_that_contradicts_the_model_makes_no_points(tmp_path: Path) -> None
                 shifted[:, 1] = np.roll(shifted[:, 1], 7)
                 geometry.inlier_matches = shifted
                 database.write_two_view_geometry(*ids, geometry)
-    complete(model, path)
+    complete(model, path, all_weak=all_weak)
     assert model.num_points3D() == 0
 
 

@@ -30,12 +30,13 @@ from colmap_affrect.colmap.model_files import (
     relative_pose,
 )
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers import mapping, snapshots
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
@@ -292,14 +293,14 @@ def test_a_model_of_a_small_set_is_large_enough(
 
 
 @pytest.mark.parametrize(
-    ("probability", "noise_share", "num_images"),
+    ("probability", "precision_factor", "num_images"),
     [(0.2, 1.0, 3), (0.04, 1.0, 2), (0.04, 0.1, 3)],
 )
 def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     probability: float,
-    noise_share: float,
+    precision_factor: float,
     num_images: int,
 ) -> None:
     """What noise leaves open is no sign of a wrong pose."""
@@ -310,7 +311,7 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
         found = dict.fromkeys(names, Confidence(0.99, ()))
         if len(names) == 3:
             doubts = (Doubt("few_matches"),)
-            found[names[-1]] = Confidence(probability, doubts, 0.0, noise_share)
+            found[names[-1]] = Confidence(probability, doubts, 0.0, precision_factor)
         return found
 
     monkeypatch.setattr(mapping, "score_images", score)
@@ -318,3 +319,22 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
     assert len(model.registered_names) == num_images
     assert len(model.doubtful) == (num_images == 3)
     assert len(model.taken_out) == (num_images == 2)
+
+
+def test_verified_pairs_are_read_once_also_where_there_are_snapshots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, num_rigs=3, num_points3D=100)
+    monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
+    read = PairGraph.read
+    num_read = list[Path]()
+
+    def counted(path: Path, min_num_matches: int) -> PairGraph:
+        num_read.append(path)
+        return read(path, min_num_matches)
+
+    monkeypatch.setattr(PairGraph, "read", counted)
+    ((model,), _) = reconstruct(path, mapper_of("sparse"))
+    assert len(model.registered_names) == 3
+    assert num_read == [path]

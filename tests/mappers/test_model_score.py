@@ -11,6 +11,7 @@ from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.model_score import (
+    MIN_SCORE_GAIN,
     ModelScorer,
     num_occupied_cells,
     pair_log_ratio,
@@ -51,3 +52,14 @@ def test_tracks_confirm_an_image_when_chance_is_twenty_times_less_likely(
     log_ratios = scorer.track_log_ratios(model).values()
     assert (math.exp(min(log_ratios)) > 20.0) == is_confirmed
     assert scorer.is_confirmed(model) == is_confirmed
+
+
+def test_images_from_one_viewpoint_do_not_confirm_each_other(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize(path, num_rigs=3, num_points3D=60)
+    scorer = ModelScorer(PairGraph.read(path), {})
+    first, second, _ = sorted(model.reg_image_ids())
+    together = {first: first, second: first}
+    assert min(scorer.track_log_ratios(model).values()) > MIN_SCORE_GAIN
+    assert set(scorer.track_log_ratios(model, together).values()) == {0.0}
+    assert scorer.track_log_ratios(model, {}) == scorer.track_log_ratios(model)

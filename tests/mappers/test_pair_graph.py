@@ -98,13 +98,13 @@ def test_images_get_the_cameras_of_records(path: Path) -> None:
 
 def test_most_connected_is_the_largest_part(path: Path) -> None:
     graph = PairGraph.read(path)
-    assert graph.most_connected == set(graph.keypoints)
+    assert graph.largest_component == set(graph.keypoints)
     part = set(sorted(graph.keypoints)[:2])
     apart = graph.without(
         [p.ids for p in graph.pairs if len(part.intersection(p.ids)) == 1]
     )
-    assert apart.most_connected == set(graph.keypoints) - part
-    assert not graph.without([pair.ids for pair in graph.pairs]).most_connected
+    assert apart.largest_component == set(graph.keypoints) - part
+    assert not graph.without([pair.ids for pair in graph.pairs]).largest_component
 
 
 def test_agreement_of_a_pair_is_computed_anew_where_a_pose_or_a_camera_is_another(

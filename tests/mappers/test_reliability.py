@@ -14,6 +14,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.parallax import mirrored_share
+from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import CameraPrior
@@ -63,6 +64,25 @@ def test_image_that_contradicts_its_pairs_is_doubted_and_the_others_are_not(
     features = features_of(mapped, task)[image.name]
     assert features.agreement < 0.2
     assert features.log_likelihood_ratio < 0.0
+
+
+def test_an_image_from_the_same_viewpoint_does_not_agree_with_a_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third photograph is in a wrong place; the others are from one viewpoint."""
+    mapped, task = scene(tmp_path, 3)
+    image = last(mapped)
+    turn = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3])
+    )
+    image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    first, second, _ = sorted(mapped.reconstruction.reg_image_ids())
+    name = mapped.reconstruction.images[first].name
+    assert features_of(mapped, task)[name].agreement > 0.4
+    monkeypatch.setattr(
+        reliability_features, "same_viewpoint_pairs", lambda *_: {(first, second)}
+    )
+    assert features_of(mapped, task)[name].agreement < 0.2
 
 
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
@@ -117,8 +137,8 @@ GOOD = ReliabilityFeatures(
     mirrored_original="",
     focal_spread=1.0,
     tie_point_log_odds=0.0,
-    bridge_edge="",
-    num_bridge_inliers=0,
+    cut_pair="",
+    num_cut_pair_inliers=0,
 )
 
 
@@ -156,11 +176,11 @@ def test_two_reasons_are_said_and_no_small_ones() -> None:
     ]
 
 
-def test_a_bridge_edge_counts_by_its_inliers() -> None:
+def test_a_cut_pair_counts_by_its_inliers() -> None:
     probabilities = []
     for num_inliers in (15, 35, 55, 100):
         features = replace(
-            GOOD, bridge_edge="a.jpg - b.jpg", num_bridge_inliers=num_inliers
+            GOOD, cut_pair="a.jpg - b.jpg", num_cut_pair_inliers=num_inliers
         )
         probabilities.append(
             confidence(features).probability / confidence(GOOD).probability
@@ -191,7 +211,7 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     assert far_off.of_evidence == pytest.approx(confidence(GOOD).probability)
 
 
-def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
+def test_a_cut_pair_casts_doubt_on_the_smaller_of_two_components(
     tmp_path: Path,
 ) -> None:
     mapped, task = scene(tmp_path, 5)
@@ -204,11 +224,11 @@ def test_a_bridge_edge_casts_doubt_on_the_smaller_of_two_components(
                 database.delete_two_view_geometry(one, two)
     names = [mapped.reconstruction.images[i].name for i in ids]
     found = features_of(mapped, task)
-    assert [bool(found[name].bridge_edge) for name in names] == [False] * 3 + [True] * 2
-    assert found[names[3]].bridge_edge == f"{names[1]} - {names[4]}"
-    assert found[names[3]].num_bridge_inliers == num
+    assert [bool(found[name].cut_pair) for name in names] == [False] * 3 + [True] * 2
+    assert found[names[3]].cut_pair == f"{names[1]} - {names[4]}"
+    assert found[names[3]].num_cut_pair_inliers == num
     alone, few = (
-        confidence(replace(found[names[3]], num_bridge_inliers=num))
+        confidence(replace(found[names[3]], num_cut_pair_inliers=num))
         for num in (200, 29)
     )
     assert few.probability < DOUBTFUL < alone.probability - 0.3
@@ -244,7 +264,7 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
     assert (
         min(
             one.pure_rotation_ratio
-            for one in features_of(mapped, replace(task)).values()
+            for one in features_of(mapped, replace(task, graphs={})).values()
         )
         > 0.9
     )

@@ -13,7 +13,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.mappers.pair_graph import PairGraph
-from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
+from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs, viewpoints
 
 WIDTH = 480
 HEIGHT = 320
@@ -86,3 +86,8 @@ def test_points_that_one_view_sees_twice_are_of_two_views() -> None:
     model.add_point3D(np.zeros(3), track)
     assert num_long_tracks(model, {}) == dict.fromkeys(images[:3], 1)
     assert not num_long_tracks(model, {images[2]: images[0]})
+
+
+def test_photographs_that_share_a_viewpoint_with_a_third_one_have_the_same() -> None:
+    assert viewpoints([(1, 3), (2, 3), (5, 9)]) == {1: 1, 2: 1, 3: 1, 5: 5, 9: 5}
+    assert viewpoints([]) == {}

@@ -22,6 +22,7 @@ from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers import adjustment
 from colmap_affrect.mappers.adjustment import FINAL, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.bridging import BridgeFinder
 from colmap_affrect.mappers.camera_priors import (
     EXIF_SIGMA,
     USUAL_FOCAL,
@@ -31,6 +32,7 @@ from colmap_affrect.mappers.camera_priors import (
     camera_prior,
     camera_priors,
 )
+from colmap_affrect.mappers.growing import Grower
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.model_score import (
     MIN_SCORE_GAIN,
@@ -38,8 +40,8 @@ from colmap_affrect.mappers.model_score import (
     pair_log_ratio,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
-from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.sparse import COLMAP_MODEL, OWN_CAMERAS
+from colmap_affrect.mappers.search import Search, _Attempt
+from colmap_affrect.mappers.sparse import COLMAP_MODEL, PER_IMAGE_CAMERAS
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -349,6 +351,96 @@ def test_cameras_of_one_image_each_begin_at_focal_lengths_from_wide_to_long(
         )
 
 
+def unknown_search(scene: Scene, kind: type[Search], **values: Any) -> Any:
+    """Return a search of one kind for cameras that nobody knows."""
+    task = task_of(scene, UNKNOWN)
+    native = mapper_of("sparse").native(task, 0)
+    graph = PairGraph.read(scene[0])
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, NOISE_PX, native.get_global_bundle_adjustment())
+    scorer = ModelScorer(graph, priors)
+    return kind(adjuster, scorer, native, 6, lambda _: None, **values)
+
+
+@dataclass(frozen=True)
+class RisingSearch(Search):
+    """Each attempt is better than those before, and lacks an image."""
+
+    model: pycolmap.Reconstruction | None = None
+    built_bridges: list[bool] = field(default_factory=list)
+
+    def is_certain(self, *_: Any, **__: Any) -> bool:
+        return False
+
+    def _attempt(self, search: Search, _: PairGraph) -> _Attempt:
+        assert self.model is not None
+        self.built_bridges.append(search.builds_bridges)
+        found = [MappedModel(pycolmap.Reconstruction(self.model))]
+        return _Attempt(found, float(len(self.built_bridges)), agrees=True)
+
+
+def without_last(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy that lacks the last image."""
+    less = pycolmap.Reconstruction(model)
+    image = less.images[max(less.reg_image_ids())]
+    less.deregister_frame(image.frame_id)
+    return less
+
+
+def test_focal_lengths_that_win_without_bridges_are_tried_with_them(
+    scene: Scene, model: pycolmap.Reconstruction
+) -> None:
+    search = unknown_search(scene, RisingSearch, model=without_last(model))
+    search.best(search.graph)
+    assert search.built_bridges == [True] + [False, True] * (len(ZOOMS) - 1)
+    search = unknown_search(scene, RisingSearch, model=model)
+    search.best(search.graph)  # no bridge is missing
+    assert search.built_bridges == [True] + [False] * (len(ZOOMS) - 1)
+
+
+def test_a_search_ends_after_as_many_failing_first_pairs_as_colmaps(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = unknown_search(scene, Search, tries_focals=False)
+    tried = list[tuple[int, int]]()
+
+    def fail(_: Grower, pair: tuple[int, int]) -> None:
+        tried.append(pair)
+
+    monkeypatch.setattr(Grower, "grow", fail)
+    assert search.best(search.graph) == []
+    assert len(tried) == len(search.graph.pairs) == 6
+    tried.clear()
+    search.native.init_num_trials = 1
+    assert search.best(search.graph) == []
+    assert len(tried) == 1
+
+
+def test_bridges_begin_with_the_priors_of_cameras_that_a_model_has_not_used(
+    scene: Scene, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The database has other focal lengths."""
+    search = unknown_search(scene, Search)
+    prior_px = 1.01 * TRUE_FOCAL
+    for key, prior in search.adjuster.priors.items():
+        search.adjuster.priors[key] = replace(prior, focal_px=prior_px)
+    less = without_last(model)
+    found = BridgeFinder(search.graph, search.adjuster, 0).find(less)
+    assert found
+    for hypothesis in found:
+        assert hypothesis.camera.mean_focal_length() == pytest.approx(prior_px)
+    focals_px = dict[int, float]()
+
+    def note(_: Grower, mapper: pycolmap.IncrementalMapper) -> None:
+        for image in mapper.reconstruction.images.values():
+            focals_px[image.image_id] = image.camera.mean_focal_length()
+
+    monkeypatch.setattr(Grower, "_complete", note)
+    search.grower(search.graph).restart_from(less)
+    assert focals_px.pop(max(focals_px)) == pytest.approx(prior_px)
+    assert set(focals_px.values()) == {TRUE_FOCAL}
+
+
 def test_colmaps_own_model_is_taken_where_ours_scores_lower(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -420,7 +512,7 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     task = MappingTask(path, None, cameras=two_places(path), may_share=True)
     large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
     assert (large.hypotheses[-1], small.hypotheses) == (
-        OWN_CAMERAS,
+        PER_IMAGE_CAMERAS,
         ("with all pairs",),
     )
     found = focals_of(large)

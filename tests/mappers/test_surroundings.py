@@ -156,6 +156,19 @@ def test_bridged_photograph_is_no_surer_than_what_it_hangs_on(tmp_path: Path) ->
     assert _no_surer_than_ties(held, mapped, task) == held
 
 
+def test_photograph_hangs_on_what_the_one_it_hangs_on_hangs_on(tmp_path: Path) -> None:
+    """Two bridged photographs that tie each other hold up neither."""
+    path = tmp_path / "database.db"
+    bridges = {f"{i}.jpg": Bridge("3.jpg", 9, 9, 0.1) for i in (4, 5)}
+    mapped = MappedModel(scene(path, everything), bridges)
+    given = {f"{number}.jpg": Confidence(0.3, ()) for number in range(4)}
+    given |= {"4.jpg": Confidence(0.9, ()), "5.jpg": Confidence(0.95, ())}
+    found = _no_surer_than_ties(given, mapped, task_with_given_cameras(path))
+    assert [found[name].probability for name in sorted(found)] == [0.3] * 6
+    for name in bridges:
+        assert found[name].reasons[0].code == "hangs_on"
+
+
 def test_two_places_with_one_poster_are_two_models_and_each_says_why(
     tmp_path: Path,
 ) -> None:

@@ -215,7 +215,9 @@ def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:
         "            of those not known mapping makes 2: photographs of one size share"
         in text
     )
-    names = [camera["names"] for camera in merge_shared_cameras(cameras)]
+    merged = merge_shared_cameras(cameras)
+    assert [camera["id"] for camera in merged] == [1, 3, 4, 5]
+    names = [camera["names"] for camera in merged]
     assert names == [["a.png", "b.png"], ["c.png"], ["d.png"], ["e.png"]]
 
 

@@ -174,7 +174,16 @@ def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
     photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, growth: float,
     are_left: bool,
 ) -> None:  # fmt: skip
-    """Which is on record: the same command says so again."""
+    """Which is on record: the same command says so again. No pair is matched twice by all."""
+    matched = list[tuple[str, str]]()
+    match_pair = CachedMatcher.__call__
+
+    def counted(matcher: CachedMatcher, names: tuple[str, str]) -> PairMatches:
+        if not matcher._matching.max_num_features:
+            matched.append(names)
+        return match_pair(matcher, names)
+
+    monkeypatch.setattr(CachedMatcher, "__call__", counted)
     monkeypatch.setattr(stage, "NUM_TRIED", 2)
     monkeypatch.setattr(stage, "MIN_GROWTH", growth)
     out = tmp_path / "out"
@@ -189,6 +198,7 @@ def test_all_features_are_not_matched_where_a_sample_of_pairs_gains_nothing(
         )
         store = MatchStore(out / "matches.h5")
         assert bool(store.nums_of_some(exhaustive_pairs(PHOTOGRAPHS))) == are_left
+        assert len(set(matched)) == len(matched) > 0
         monkeypatch.setattr(stage, "MIN_GROWTH", 0.0)
 
 

@@ -109,7 +109,7 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
     assert (camera.width, camera.height) == IMAGE_SIZE
     (record,) = read_camera_records(workspace.cameras).values()
-    assert (record.names, record.source, record.is_fixed) == (
+    assert (record.names, record.source, record.is_all_given) == (
         tuple(names),
         "given",
         True,

@@ -536,6 +536,17 @@
     say(`Marks from before: ${marks.length}. Undo goes back to those of the run.`);
   }
   show();
+  // For a server that maps again: marks as it takes them, and the residuals that it returns.
+  page.tiePoints = {
+    rows: () => ordered().map(({ point, photo, x, y }) => [point, photographs[photo][0], x, y]),
+    take(residuals) {
+      const errors = new Map(residuals.map(([point, name, px]) => [JSON.stringify([point, name]), px]));
+      marks = marks.map((mark) =>
+        ({ ...mark, error: errors.get(JSON.stringify([mark.point, photographs[mark.photo][0]])) }));
+      keep();
+      show();
+    },
+  };
   page.markIn = (one, two) => {
     section.querySelector("details").open = true;
     [one, two].forEach((photo, side) => photographs[photo] && panes[side].load(photo));

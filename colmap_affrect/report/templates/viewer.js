@@ -8,7 +8,8 @@
   const [NEAR_PX, DRAG_PX, MAX_LABELLED, MAX_PICTURES] = [16, 6, 80, 200];
   const [POINT_PX, ARROW_PX, CROP_PX, CROP_SHARE] = [9, 40, 120, 0.12];
   const [SEEN_COLOR, CHOSEN_COLOR] = [0xff00e0ff, "#ff2fd0"];
-  const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false, size: 1, fade: 0.8 };
+  const BEFORE_COLOR = [194, 87, 0];
+  const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false, size: 1, fade: 0.8, after: 0.5 };
   let pointedAt = -1;
   let isWaiting = false;
 
@@ -54,16 +55,26 @@
     return right > 0 ? 3 : 1;
   }
 
+  // Points and cameras, as models are drawn with.
+  function contentOf(view) {
+    const { count, cameras, points } = view;
+    const buffer = bytes(points).buffer;
+    return {
+      count, cameras,
+      places: Float32Array.from(new Uint16Array(buffer, 0, 3 * count), (p) => p / 32767.5 - 1),
+      colors: new Uint8Array(buffer, 6 * count),
+      drawn: cameras.filter((camera) => camera.index >= 0),
+    };
+  }
+
   class Model {
     constructor(canvas) {
       const view = data.views[canvas.dataset.model];
-      const buffer = bytes(view.points).buffer;
-      this.count = view.count;
-      this.places = Float32Array.from(new Uint16Array(buffer, 0, 3 * this.count), (p) => p / 32767.5 - 1);
-      this.colors = new Uint8Array(buffer, 6 * this.count);
-      this.cameras = view.cameras;
-      this.drawn = view.cameras.filter((camera) => camera.index >= 0);
+      this.content = contentOf(view);
+      Object.assign(this, this.content);
       this.readTracks(view.tracks);
+      this.before = canvas.dataset.before ? contentOf(data.views[canvas.dataset.before]) : null;
+      this.before?.colors.forEach((_, at, colors) => (colors[at] = BEFORE_COLOR[at % 3]));
       this.canvas = canvas;
       this.context = canvas.getContext("2d");
       this.layer = document.createElement("canvas");
@@ -216,10 +227,37 @@
       const project = this.projection(width, height, eye.zoom, density);
       const isWhole = !this.through || this.through.zoom === 1;
       canvas.style.touchAction = isWhole ? "pan-y" : "none";
+      if (this.before) this.drawBefore(project, width, height, density);
       this.drawPoints(project, width, height, density);
       if (this.through) this.drawPhotograph(width, height, density);
       else this.drawCameras(project, density);
       if (this.chosen >= 0) this.drawChosen(project, density);
+      if (this.before) this.blend(width, height);
+    }
+
+    // The model of a run before, on a layer of its own.
+    drawBefore(project, width, height, density) {
+      const known = this.context;
+      Object.assign(this.layer, { width, height });
+      this.context = this.layer.getContext("2d");
+      Object.assign(this, this.before);
+      this.drawPoints(project, width, height, density);
+      this.drawCameras(project, density);
+      Object.assign(this, this.content, { context: known });
+    }
+
+    // Both as strongly in the middle of the slider, one alone at each end.
+    blend(width, height) {
+      const { context } = this;
+      const now = this.now ??= document.createElement("canvas");
+      Object.assign(now, { width, height });
+      now.getContext("2d").drawImage(context.canvas, 0, 0);
+      context.clearRect(0, 0, width, height);
+      context.globalAlpha = Math.min(1, 2 - 2 * eye.after);
+      context.drawImage(this.layer, 0, 0);
+      context.globalAlpha = Math.min(1, 2 * eye.after);
+      context.drawImage(now, 0, 0);
+      context.globalAlpha = 1;
     }
 
     // Below the points, as it lies on the canvas.
@@ -612,6 +650,11 @@
     const button = document.querySelector(`[data-shows="${model.canvas.dataset.model}"]`);
     button?.setAttribute("aria-pressed", String(isShown));
   }
+
+  document.getElementById("before-after")?.addEventListener("input", (event) => {
+    eye.after = event.target.value / 100;
+    redraw();
+  });
 
   // Looking through photographs: a list, buttons, and the other scripts.
   const bar = document.getElementById("look");
