@@ -32,7 +32,7 @@ pytestmark = [
     ("rectified", "fountain 0,5,10", 3, 0.5),
     ("rectified", "herz 0,8,16,24", 4, 0.5),
     ("rectified", "kermit /2", 6, 2.0),
-    ("rectified", "sacre_coeur /2", 5, 2.5),
+    ("rectified", "sacre_coeur /2", 5, 1.5),
     ("on-demand", "herz 0,8,16,24", 4, 0.5),
 ])  # fmt: skip
 def test_sparse_subset_registers_correctly(

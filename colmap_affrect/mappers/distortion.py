@@ -1,4 +1,4 @@
-"""Which cameras have images that can tell their distortion.
+"""Which cameras have images that can tell their distortion, and how it begins.
 
 What an image says of its camera is what its features say more than points and pose need. A point
 that n images see has 2 n coordinates for three of its own, so that 2 - 3 / n of each observation
@@ -7,13 +7,19 @@ observations (Förstner and Wrobel, Photogrammetric Computer Vision, 2016) the p
 """
 
 from collections import defaultdict
+from collections.abc import Mapping
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.model_score import GRID, grid_cells
-from colmap_affrect.mappers.pair_graph import PairGraph, num_matched_images
+from colmap_affrect.mappers.pair_graph import (
+    PairGraph,
+    num_matched_images,
+    used_cameras,
+)
 
 NUM_POSE_PARAMETERS = 6  # theory
 MIN_NUM_IMAGES = 3
@@ -56,3 +62,18 @@ def redundancy_of(
     np.maximum.at(most, grid_cells(camera, keypoints), num_partners)
     num_views = most[most > 0] + 1
     return max(0.0, float((2.0 - 3.0 / num_views).sum()) - NUM_POSE_PARAMETERS)
+
+
+def straighten(
+    model: pycolmap.Reconstruction, priors: Mapping[int, CameraPrior]
+) -> None:
+    """Take the distortion of unknown cameras away, in place.
+
+    Args:
+        model: Whose cameras change.
+        priors: What is known of them, by camera id.
+    """
+    for camera in used_cameras(model).values():
+        if priors[camera.camera_id].is_unknown:
+            for index in camera.extra_params_idxs():
+                camera.params[index] = 0.0

@@ -294,6 +294,7 @@ class _HypothesisTest:
                 self._try_per_image_cameras(hypothesis)
         if not self._is_certain():
             self._try_colmap()
+        self._try_straight_lens()
         self._try_shifted_axes()
         self.best = with_other_groups(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
@@ -365,6 +366,14 @@ class _HypothesisTest:
         if SHIFTED_AXES in told:
             free = with_free_principal_points(self.search, self.task.cameras)
             self.search = free or self.search
+
+    def _try_straight_lens(self) -> None:
+        """Adjust the best model from a straight lens where that leads to a better optimum."""
+        if not self.best or not self.search.unknown:
+            return
+        model = self.search.from_straight_lens(self.best[0].reconstruction)
+        self.best = [replace(self.best[0], reconstruction=model), *self.best[1:]]
+        self.score = self.search.best_score(self.best)
 
     def _try_shifted_axes(self) -> None:
         """Free the principal points of the best model where its points ask for it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,21 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import (
     camera_prior,
+    camera_priors,
     is_off_center,
     shifted_principal_point,
 )
+from colmap_affrect.mappers.model_score import ModelScorer
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.principal_points import (
+    contradict_held,
+    with_free_principal_points,
+)
+from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.sparse import SHIFTED_AXES
 
 NUM_IMAGES = 6
@@ -173,3 +183,48 @@ def test_an_axis_that_mapping_moved_has_the_prior_of_a_print() -> None:
     given = replace(UNKNOWN, given=("principal-point",))
     assert camera_prior(camera, given).principal_point is None
     assert camera_prior(camera, WHOLE).principal_point is None
+
+
+@pytest.mark.parametrize(
+    ("crop_share", "shift_share", "contradict"),
+    [
+        (0.9, 0.9, False),  # less than view cameras need
+        (1.1, 1.1, True),  # that is enough for a shift up or down
+        (1.9, 0.9, False),  # less than crops need, which move both ways
+        (2.1, 0.9, True),
+    ],
+)
+def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    crop_share: float,
+    shift_share: float,
+    *,
+    contradict: bool,
+) -> None:
+    """Shares are those of half the logarithm of the number of observations, per camera."""
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
+    task = MappingTask(path, None, cameras=records_of(truth, UNKNOWN))
+    graph = PairGraph.read(path)
+    native = mapper_of("sparse").native(task, 0)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
+    held = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    free = with_free_principal_points(held, task.cameras)
+    assert free is not None
+    unit = 3 * 0.5 * math.log(truth.compute_num_observations())
+
+    def costs(search: Search, _: pycolmap.Reconstruction) -> tuple[float, float]:
+        axis = search.adjuster.priors[1].principal_point
+        if axis is None:
+            return 2000.0, 1000.0
+        across_px, down_px = axis.sigmas_px
+        assert down_px == pytest.approx(0.15 * 1024)
+        is_crop = across_px == pytest.approx(0.15 * 1024)
+        assert is_crop or across_px == pytest.approx(0.02 * 1024)
+        share = crop_share if is_crop else shift_share
+        return 1000.0 - share * unit, 2000.0
+
+    monkeypatch.setattr(Search, "costs_of_starts", costs)
+    assert contradict_held(truth, held, free) == contradict
