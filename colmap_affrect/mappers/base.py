@@ -124,6 +124,8 @@ class MappedModel:
     axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
     """By the names of images: how far rotations change where principal points that points
     contradict are freed, though that makes no better model."""
+    motion_share: float = 1.0
+    """Share of what moves as the model says, before cameras were freed, which may hide the rest."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
 

@@ -82,11 +82,19 @@ class RelativePose:
 
 
 @dataclass(frozen=True)
-class _Agreement:
-    """Which matches agree with a relative pose."""
+class Agreement:
+    """How well matches agree with a relative pose."""
 
-    agrees: Bools  # (M,)
+    errors_px: (
+        Array  # (M,) Sampson errors, infinite where no point in front explains a match
+    )
+    tolerance_px: float  # largest error of a match that agrees
     depths: Depths  # of all matches
+
+    @property
+    def agrees(self) -> Bools:
+        """Tell which matches agree."""
+        return self.errors_px <= self.tolerance_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +290,7 @@ class PairGraph:
             return known.share
         pose = relative_pose(poses[first], poses[second])
         share = float(
-            _compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
+            compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
         )
         self._agreements[pair.ids] = _KnownAgreement(pair, asked, share)
         return share
@@ -322,7 +330,7 @@ class PairGraph:
         both = cameras[pair.ids[0]], cameras[pair.ids[1]]
         allowed = list[RelativePose]()
         for pose in self._candidate_poses(pair, both, random_seed):
-            found = _compared_with_pose(pose, both, self.points(pair))
+            found = compared_with_pose(pose, both, self.points(pair))
             has_depth = found.agrees & (found.depths.angles_deg > MIN_ANGLE_DEG)
             if found.agrees.mean() >= MIN_SHARE and has_depth.any():
                 depths = found.depths.first[has_depth], found.depths.second[has_depth]
@@ -412,9 +420,9 @@ def sampling_step(num_items: int, max_num: int) -> int:
     return max(1, math.ceil(num_items / max_num))
 
 
-def _compared_with_pose(
+def compared_with_pose(
     pose: Pose, cameras: Cameras, points: tuple[Array, Array]
-) -> _Agreement:
+) -> Agreement:
     """Compare matches with a relative pose.
 
     Args:
@@ -437,7 +445,8 @@ def _compared_with_pose(
     longer_sides = [max(camera.width, camera.height) for camera in cameras]
     tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * side for side in longer_sides))
     is_possible = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
-    return _Agreement((errors <= tolerance) & is_possible, depths)
+    errors = np.where(is_possible, errors, np.inf)
+    return Agreement(errors, tolerance, depths)
 
 
 def _read_pairs(

@@ -18,6 +18,7 @@ from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.groups import with_other_groups
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
+from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
@@ -372,7 +373,10 @@ class _HypothesisTest:
         if free is None or not contradict_held(model, search, free):
             return
         changed = with_shifted_axes(model, free, search.graph)
-        changed_model = replace(self.best[0], reconstruction=changed)
+        share = self._motion_share(self.best[0])
+        changed_model = replace(
+            self.best[0], reconstruction=changed, motion_share=share
+        )
         found = free.with_bridges(search.graph, [changed_model])
         found = with_own_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
@@ -394,12 +398,22 @@ class _HypothesisTest:
         if model is None or self.own.scorer.score(model) <= self.score + MIN_SCORE_GAIN:
             return
         changed = replace(
-            first, reconstruction=model, hypotheses=(*first.hypotheses, OWN_CAMERAS)
+            first,
+            reconstruction=model,
+            hypotheses=(*first.hypotheses, OWN_CAMERAS),
+            motion_share=self._motion_share(first),
         )
         self.best = with_own_images([changed, *self.best[1:]])
         self.search = self.own
         self.own = None
         self.score = self.search.best_score(self.best)
+
+    def _motion_share(self, mapped: MappedModel) -> float:
+        """Return the share of what moves as a model says: other cameras may hide the rest."""
+        found = share_of_motion(
+            mapped.reconstruction, self.search.graph, self.task.database_path
+        )
+        return min(found, mapped.motion_share)
 
 
 def _extract_colors(
