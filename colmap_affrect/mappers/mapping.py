@@ -255,6 +255,8 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
     places = places_of(mapped.reconstruction, graph)
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
+    for name, doubt in mapped.apart.items():
+        scored.taken_out[name] = Confidence(0.0, (doubt,))
     found = [scored]
     for other in others:
         names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]

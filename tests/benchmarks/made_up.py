@@ -1,10 +1,11 @@
 r"""Sets of photographs in which something false ties them, from scenes whose poses are known.
 
 Kinds: `poster`, the same print in two places; `posters`, three prints; `collage`, photographs of
-two places side by side; `elsewhere`, a print of one place in photographs of another one; `moving`,
-a surface that flows on from photograph to photograph, before a scene that stays; `drifting`, a
-rough surface that travels as one, as ice does; `true`, none of this. A print is drawn as a board
-that stands in the scene, in right perspective. Usage:
+two places side by side; `elsewhere`, a print of one place in photographs of another one; `statue`,
+the same rough surface in two places; `tower`, a box whose four sides are the same; `moving`, a
+surface that flows on from photograph to photograph, before a scene that stays; `drifting`, a rough
+surface that travels as one, as ice does; `true`, none of this. A print is drawn as a board that
+stands in the scene, in right perspective. Usage:
 
     python tests/benchmarks/made_up.py make OUT --kind poster --first SCENE --second SCENE \
         --print JPG
@@ -34,7 +35,17 @@ from colmap_affrect.project.report import SURE
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
-KINDS = ("poster", "posters", "collage", "elsewhere", "moving", "drifting", "true")
+KINDS = (
+    "poster",
+    "posters",
+    "collage",
+    "elsewhere",
+    "statue",
+    "tower",
+    "moving",
+    "drifting",
+    "true",
+)
 NUM_STRIPS = 6  # of a rough surface
 ROUGHNESS = (
     0.12  # of the distance of a rough surface, that its strips are apart in depth
@@ -195,12 +206,43 @@ def draw_drifting(
         if arguments.times == 1:
             time = step // arguments.still_for
         right, down, ahead = arguments.travel
+        if arguments.kind == "statue":
+            time = 0
         way = time * (right * width + down * height + ahead * depth)
         for index in (1, 3, 5, 0, 2, 4):  # what is farther away first
             moved = Board(
                 strips[index].middle + way, strips[index].right, strips[index].down
             )
             draw(shot, moved, print_[rows[index]])
+
+
+def draw_tower(shots: list[Shot], print_: Picture, share: float) -> None:
+    """Draw a box whose four sides show the same.
+
+    Args:
+        shots: Of a scene.
+        print_: What each side shows.
+        share: Of the width of photographs that a side takes.
+    """
+    front = board_before(shots, share, 0.0)
+    up = front.down / np.linalg.norm(front.down)
+    radius = float(np.linalg.norm(front.right))
+    viewer = np.mean([shot.center for shot in shots], axis=0)
+    ahead = np.cross(front.right / radius, up)
+    ahead *= np.sign(ahead @ (front.middle - viewer))
+    middle = front.middle + radius * ahead
+    sides = []
+    for normal, right in (
+        (-ahead, front.right),
+        (front.right / radius, radius * ahead),
+        (ahead, -front.right),
+        (-front.right / radius, -radius * ahead),
+    ):
+        sides.append((normal, Board(middle + radius * normal, right, front.down)))
+    for shot in shots:
+        for normal, board in sides:
+            if normal @ (shot.center - board.middle) > 0.0:
+                draw(shot, board, print_)
 
 
 def read_print(path: Path, size_px: int) -> Picture:
@@ -229,9 +271,13 @@ def change(
     share = arguments.share
     if kind == "true":
         return {}
-    if kind == "drifting":
+    if kind in ("drifting", "statue"):
         for shots in groups.values():
             draw_drifting(shots, prints[0], arguments)
+        return {}
+    if kind == "tower":
+        for shots in groups.values():
+            draw_tower(shots, prints[0], share)
         return {}
     if kind == "collage":
         pictures = [shots[0].picture for shots in groups.values()]
