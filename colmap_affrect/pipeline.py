@@ -123,9 +123,8 @@ def _run(
         mapper,
         size_of=lambda name: header_size(image_path / name),
     )
-    forecast = Forecast(
-        len(names), _num_pairs(names, options=options.pairs, image_path=image_path)
-    )
+    num_pairs = _num_pairs(names, options=options.pairs, image_path=image_path)
+    forecast = Forecast(len(names), num_pairs)
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     if options.extend:
         existing_names(options.extend.model_path, names)
@@ -134,6 +133,8 @@ def _run(
     resolve(recipe.required_weights, weights_path, progress=context.progress)
     load_matchers(context, recipe.extraction, options=recipe.matching)
     later = options.later_stages()
+    if overwrite or not workspace.features.exists():
+        recipe.matching.load_meanwhile(num_pairs)
     with workspace.locked(), mend_and_seal(context, follows=False, discards=overwrite):
         reports = [
             extract_features(context, inputs, recipe, later=later, overwrite=overwrite),

@@ -177,9 +177,13 @@ class _Views:
         own_depths = positions @ pose[2, :3] + pose[2, 3]
         camera = self.model.cameras[image.camera_id]
         radius_px = NEIGHBOR_RADIUS * max(camera.width, camera.height)
-        distances = np.linalg.norm(places[:, None] - own[None], axis=2)
-        nearest = np.argsort(distances, axis=1)[:, :NUM_NEIGHBORS]
-        is_known = np.take_along_axis(distances, nearest, axis=1)[:, -1] < radius_px
+        across = places[:, :1] - own[:, 0]
+        down = places[:, 1:] - own[:, 1]
+        distances = np.hypot(across, down)
+        nearest = np.argpartition(distances, NUM_NEIGHBORS - 1, axis=1)
+        nearest = nearest[:, :NUM_NEIGHBORS]
+        farthest = np.take_along_axis(distances, nearest, axis=1).max(axis=1)
+        is_known = farthest < radius_px
         surfaces = np.median(own_depths[nearest], axis=1)
         return np.asarray(is_known & (depths > HIDDEN * surfaces))
 

@@ -32,6 +32,9 @@ class MatcherOptions(NetworkOptions):
     def require_extractor(self, extractor: str) -> None:
         """Raise OptionError for a kind of features that cannot be matched; an empty one passes."""
 
+    def load_meanwhile(self, num_pairs: int) -> None:
+        """Begin to load, in another thread, libraries that matching that many pairs will need."""
+
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):

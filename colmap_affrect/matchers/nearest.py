@@ -48,6 +48,10 @@ class NearestOptions(MatcherOptions):
     """Of matches closer than this at both ends the best one stays."""
     max_num_first: Annotated[int, within(0, 1_000_000)] = 8192  # resource
 
+    def load_meanwhile(self, num_pairs: int) -> None:
+        """Begin to load torch, where so many pairs of images take it."""
+        nearest_8bit.load_meanwhile(float(num_pairs) * self.max_num_first**2)
+
 
 @dataclass(frozen=True)
 class MatchableImage:

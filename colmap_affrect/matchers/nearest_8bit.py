@@ -5,7 +5,9 @@ be; only these are compared exactly. Six standard deviations of the rounding err
 so that matches are those of exact cosines. torch is loaded where there is enough to match.
 """
 
+import importlib
 import math
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -73,8 +75,27 @@ class CoarseDescriptors:
 
 def coarse_pays(num_comparisons: float) -> bool:
     """Tell whether coarse cosines save time, for the number of all pairs of features to come."""
-    enough = num_comparisons >= MIN_COMPARISONS_PER_CORE * available_cores()
-    return enough and has_fast_8_bit_products()
+    return _is_enough(num_comparisons) and has_fast_8_bit_products()
+
+
+def load_meanwhile(num_comparisons: float) -> None:
+    """Load torch in another thread where there will be enough to match.
+
+    While features are extracted, which leaves Python alone for most of the time, that is over
+    before it is missed.
+
+    Args:
+        num_comparisons: of pairs of features, at most.
+    """
+    if _is_enough(num_comparisons):
+        load = threading.Thread(
+            target=importlib.import_module, args=("torch",), daemon=True
+        )
+        load.start()
+
+
+def _is_enough(num_comparisons: float) -> bool:
+    return num_comparisons >= MIN_COMPARISONS_PER_CORE * available_cores()
 
 
 def short_lists(

@@ -310,7 +310,7 @@ def prepare(
         for part in level.network_parts:
             keys.update(part.weights)
     weights = resolve(sorted(keys), resources.weights_path, progress=progress)
-    uses_network = any(level.uses_networks for level in options.levels)
+    uses_network = any(level.uses_networks for level in levels.values())
     network = NetworkContext(
         weights, resources.require_device(uses_network=uses_network)
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
+import threading
 
 import numpy as np
 import pytest
@@ -137,3 +139,16 @@ def test_torch_without_the_products_matches_exactly(
     has_fast_8_bit_products.cache_clear()
     features = LocalFeatures.empty(128)
     assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None
+
+
+def test_torch_is_loaded_meanwhile_where_there_will_be_enough_to_match(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loaded = threading.Event()
+    monkeypatch.setattr(importlib, "import_module", lambda _: loaded.set())
+    monkeypatch.setattr(coarse, "available_cores", lambda: 2)
+
+    NearestOptions().load_meanwhile(num_pairs=10)
+    assert not loaded.wait(0.01)
+    NearestOptions().load_meanwhile(num_pairs=30)
+    assert loaded.wait(5.0)
