@@ -183,10 +183,20 @@ def strips_of(board: Board, viewer: Array) -> list[Board]:
     return found
 
 
-def draw_drifting(
+def draw_solid(
     shots: list[Shot], print_: Picture, arguments: argparse.Namespace
 ) -> None:
-    """Draw a rough surface that travels as one from photograph to photograph.
+    """Draw what is no board: a tower, or a rough surface."""
+    if arguments.kind == "tower":
+        draw_tower(shots, print_, arguments.share)
+    else:
+        draw_rough(shots, print_, arguments)
+
+
+def draw_rough(
+    shots: list[Shot], print_: Picture, arguments: argparse.Namespace
+) -> None:
+    """Draw a rough surface, which may travel as one from photograph to photograph.
 
     Args:
         shots: Of a scene, in the order of time.
@@ -271,13 +281,9 @@ def change(
     share = arguments.share
     if kind == "true":
         return {}
-    if kind in ("drifting", "statue"):
+    if kind in ("drifting", "statue", "tower"):
         for shots in groups.values():
-            draw_drifting(shots, prints[0], arguments)
-        return {}
-    if kind == "tower":
-        for shots in groups.values():
-            draw_tower(shots, prints[0], share)
+            draw_solid(shots, prints[0], arguments)
         return {}
     if kind == "collage":
         pictures = [shots[0].picture for shots in groups.values()]
