@@ -268,13 +268,15 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
         _doubt_motion(model, task)
         for image_id in places.collages:
             _doubt(model, graph.names[image_id], 0.5, Doubt("two_places"))
+        for image_id, share in places.unclear.items():
+            _doubt(model, graph.names[image_id], share, Doubt("other_surroundings"))
     return found
 
 
 def _doubt_motion(model: _ScoredModel, task: MappingTask) -> None:
     """Doubt a model where something moves in another way: that may be the scene as well."""
     graph = graph_of(task, MIN_NUM_MATCHES)
-    found = share_of_motion(model.mapped.reconstruction, graph, task.database_path)
+    found = share_of_motion(model.mapped.reconstruction, graph)
     share = min(found, model.mapped.motion_share)
     if share < 1.0:
         doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})

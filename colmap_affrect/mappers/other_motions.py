@@ -9,12 +9,10 @@ moves is the same surface again and again.
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import relative_pose
 from colmap_affrect.colmap.verification import (
     Side,
@@ -38,9 +36,6 @@ MAX_NUM_PAIRS = 300  # of a model that are looked at, the strongest; resource
 FARTHER = 1.5
 """Times the tolerance of matches that agree, from which on they contradict: between are those of
 poses and lenses that are not quite right (judged)."""
-MIN_SIGNIFICANCE = 8.0
-"""As of verification, where 5 is: of all pairs of a thousand sets one looks as good by chance
-(theory)."""
 MIN_CHAINED = 1.0 / 3.0
 """Of the matches of another motion, the share that moves in another pair, too. Measured: 0.4 to
 0.95 of surfaces that were made to move, up to 0.2 of repeated windows and of wrong matches."""
@@ -88,15 +83,12 @@ class _Motions:
         return num_chained >= MIN_CHAINED * len(self.other)
 
 
-def share_of_motion(
-    model: pycolmap.Reconstruction, graph: PairGraph, database_path: Path
-) -> float:
+def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
     """Return the share of what moves as a model says, where something moves in another way, too.
 
     Args:
         model: The model.
-        graph: Its pairs.
-        database_path: Has keypoints, and the raw matches of these pairs.
+        graph: Its pairs, with their raw matches.
 
     Returns:
         Of the cells of the pairs that show another motion; 1 where too few of the pairs do.
@@ -105,11 +97,10 @@ def share_of_motion(
     pairs = _strongest(graph.pairs_inside(poses))
     cameras = cameras_of(model)
     found = list[_Motions]()
-    with open_database(database_path) as database:
-        for pair in pairs:
-            motions = _motions_of_pair(pair, poses, cameras, database)
-            if motions:
-                found.append(motions)
+    for pair in pairs:
+        motions = _motions_of_pair(pair, poses, cameras, graph)
+        if motions:
+            found.append(motions)
     num_pairs = _num_pairs_of_features(found)
     showing = list[_Motions]()
     for motions in found:
@@ -145,7 +136,7 @@ def _motions_of_pair(
     pair: VerifiedPair,
     poses: PoseById,
     cameras: CameraById,
-    database: pycolmap.Database,
+    graph: PairGraph,
 ) -> _Motions | None:
     """Return what moves as poses say, and what as one in another way; None where nothing does.
 
@@ -153,13 +144,13 @@ def _motions_of_pair(
         pair: The pair.
         poses: cam_from_world of its images, by image id.
         cameras: Of its images, by image id.
-        database: Has keypoints and raw matches.
+        graph: Has keypoints and raw matches.
     """
     first, second = pair.ids
-    raw = np.asarray(database.read_matches(first, second), np.int64).reshape(-1, 2)
+    raw = graph.raw_matches.get(pair.ids, pair.matches)
     matches = np.unique(np.concatenate([raw, pair.matches]), axis=0)
-    keypoints1 = np.asarray(database.read_keypoints(first), np.float32)
-    keypoints2 = np.asarray(database.read_keypoints(second), np.float32)
+    keypoints1 = graph.shaped_keypoints.get(first, graph.keypoints[first])
+    keypoints2 = graph.shaped_keypoints.get(second, graph.keypoints[second])
     sides = Side(cameras[first], keypoints1), Side(cameras[second], keypoints2)
     points1 = keypoints1[matches[:, 0], :2].astype(np.float64)
     points2 = keypoints2[matches[:, 1], :2].astype(np.float64)
@@ -168,7 +159,7 @@ def _motions_of_pair(
     agreement = compared_with_pose(pose, both, (points1, points2))
     agrees = agreement.agrees
     is_far = ~(agreement.errors_px <= FARTHER * agreement.tolerance_px)
-    options = VerificationOptions(min_significance=MIN_SIGNIFICANCE)
+    options = VerificationOptions()
     if is_far.sum() < options.min_num_inliers:
         return None
     geometry = estimate_geometry(sides, matches[is_far], options)

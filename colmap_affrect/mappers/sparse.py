@@ -434,9 +434,7 @@ class _HypothesisTest:
 
     def _motion_share(self, mapped: MappedModel) -> float:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
-        found = share_of_motion(
-            mapped.reconstruction, self.search.graph, self.task.database_path
-        )
+        found = share_of_motion(mapped.reconstruction, self.search.graph)
         return min(found, mapped.motion_share)
 
 

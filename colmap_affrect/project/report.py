@@ -245,12 +245,17 @@ class ModelSummary:
         """Names of the images that are rather right than wrong."""
         return set(self.registered_names) - self.doubtful.keys()
 
-    def classes_text(self) -> str:
+    def class_counts(self) -> dict[str, int]:
         """Return how many photographs are sure, unsure and doubtful."""
         num_sure = len(self.sure)
         num_doubtful = len(self.doubtful)
         num_unsure = len(self.registered_names) - num_sure - num_doubtful
-        return f"{num_sure}, unsure {num_unsure}, doubtful {num_doubtful}"
+        return {"sure": num_sure, "unsure": num_unsure, "doubtful": num_doubtful}
+
+    def classes_text(self) -> str:
+        """Return these numbers, the sure ones first."""
+        counts = self.class_counts()
+        return f"{counts['sure']}, unsure {counts['unsure']}, doubtful {counts['doubtful']}"
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""

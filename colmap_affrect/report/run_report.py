@@ -99,7 +99,7 @@ class RunReport(ReconstructionReport):
         if self.models:
             model = self.models[0]
             counts |= {
-                "sure": model.classes_text(),
+                **{key: f"{num}" for key, num in model.class_counts().items()},
                 "points": f"{model.num_points3D:,}",
                 "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
             }

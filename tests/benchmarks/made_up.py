@@ -328,7 +328,8 @@ def make(arguments: argparse.Namespace) -> None:
             cv2.imwrite(
                 str(images / name), shot.picture, [cv2.IMWRITE_JPEG_QUALITY, 93]
             )
-            truth[name] = [group, shot.rotation.tolist(), shot.translation.tolist()]
+            place = scenes[group][0].name  # two groups of one scene are one place
+            truth[name] = [place, shot.rotation.tolist(), shot.translation.tolist()]
     for name, picture in others.items():
         cv2.imwrite(str(images / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 93])
     (folder / TRUTH).write_text(json.dumps(truth), encoding="utf-8")

@@ -91,7 +91,7 @@ def scene(
 
 def share(path: Path, left_of: float, *, repeats: bool = False) -> float:
     model = scene(path, left_of, repeats=repeats)
-    return share_of_motion(model, PairGraph.read(path), path)
+    return share_of_motion(model, PairGraph.read(path))
 
 
 def middle_of_wall() -> float:

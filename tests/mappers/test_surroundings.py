@@ -21,7 +21,7 @@ from colmap_affrect.mappers.groups import with_places_mapped_again
 from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
-from colmap_affrect.mappers.surroundings import places_of
+from colmap_affrect.mappers.surroundings import Overlap, _merged, places_of
 from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
@@ -227,3 +227,18 @@ def test_a_model_of_one_place_is_not_mapped_again(tmp_path: Path) -> None:
 
     found = with_places_mapped_again([whole], PairGraph.read(path), never)
     assert [mapped.reconstruction for mapped in found] == [whole.reconstruction]
+
+
+@pytest.mark.parametrize(
+    ("found", "unclear"),
+    [(28.0, set()), (16.0, {1, 2}), (22.0, set())],
+)
+def test_of_parts_that_are_rather_two_places_the_smaller_one_is_unclear(
+    found: float, unclear: set[int]
+) -> None:
+    overlaps = {(1, 3): Overlap(28.0, found), (2, 4): Overlap(28.0, found)}
+    probabilities = dict[int, float]()
+    merged = _merged([{1, 2}, {3, 4, 5}], overlaps, probabilities)
+    assert merged == [{1, 2, 3, 4, 5}]
+    assert set(probabilities) == unclear
+    assert all(probability < DOUBTFUL for probability in probabilities.values())
