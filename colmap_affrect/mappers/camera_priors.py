@@ -346,12 +346,14 @@ def camera_priors(
     """Return the priors of cameras, by camera id.
 
     Args:
-        cameras: Cameras of a database.
+        cameras: Cameras of a database; those of many images may come as often.
         records: What is on record of them, by camera id.
         lines: What lines say, by image name.
     """
-    found = {}
+    found = dict[int, CameraPrior]()
     for camera in cameras:
+        if camera.camera_id in found:
+            continue
         record = records.get(camera.camera_id)
         of_images = [
             lines[name] for name in (record.names if record else ()) if name in lines

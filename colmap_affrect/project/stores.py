@@ -231,6 +231,19 @@ class FeatureStore(GroupStore):
         with self._open("r") as file:
             return lines_from_datasets(_line_datasets(self._group(file, name)))
 
+    def lines_of(self, names: Iterable[str]) -> dict[str, Lines]:
+        """Return the straight lines of images, without those that have none, in one opening."""
+        found = dict[str, Lines]()
+        if not self.path.exists():
+            return found
+        with self._open("r") as file:
+            for name in names:
+                if has_entry(file, name):
+                    lines = lines_from_datasets(_line_datasets(file[name]))
+                    if lines is not None:
+                        found[name] = lines
+        return found
+
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, rising.
 

@@ -1,15 +1,16 @@
 """What a run returns: its report, its models, and how a notebook shows it."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cameras import CameraRecord, read_camera_records
+from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord, read_camera_records
 from colmap_affrect.errors import NoModelError, OptionError, shown, such_as
+from colmap_affrect.geometry.lines import LineCamera, Lines
 from colmap_affrect.mappers.camera_priors import (
     FocalContradiction,
     focal_contradictions,
@@ -197,35 +198,40 @@ def cameras_of_report(
 
 
 def lines_of_report(
-    features: FeatureStore, names: Sequence[str]
+    features: FeatureStore, lines: Mapping[str, Lines]
 ) -> dict[str, LineReport]:
-    """Return what straight lines say of photographs, without those that older versions read."""
-    found = {}
+    """Return what straight lines say of photographs.
+
+    Args:
+        features: of the run.
+        lines: of the photographs.
+    """
     sizes = features.image_sizes()
-    for name in names:
-        lines = features.lines(name) if name in sizes else None
-        if lines is not None:
-            found[name] = line_report(lines, sizes[name])
-    return found
+    return {name: line_report(found, sizes[name]) for name, found in lines.items()}
 
 
-def contradictions_of_report(context: Context) -> tuple[FocalContradiction, ...]:
-    """Return the focal lengths of EXIF and of the user that stored straight lines contradict."""
-    workspace = context.workspace
-    if workspace.is_foreign:
-        return ()
-    lines = {}
-    sizes = context.features.image_sizes()
-    for name in context.graph.ids:
-        stored = context.features.lines(name) if name in sizes else None
-        of_lines = stored.camera() if stored is not None else None
-        if of_lines is not None:
-            lines[name] = of_lines
+def contradictions_of_report(
+    context: Context, lines: Mapping[str, Lines]
+) -> tuple[FocalContradiction, ...]:
+    """Return the focal lengths of EXIF and of the user that straight lines contradict.
+
+    Args:
+        context: of the run.
+        lines: of its photographs.
+    """
+    records = read_camera_records(context.workspace.cameras)
+    line_cameras = dict[str, LineCamera]()
+    for record in records.values():
+        if record.source not in TRUSTED:
+            continue
+        for name in record.names:
+            by_lines = lines[name].camera() if name in lines else None
+            if by_lines is not None:
+                line_cameras[name] = by_lines
     cameras = {}
     for camera in context.graph.cameras.values():
         cameras[camera.camera_id] = camera
-    records = read_camera_records(workspace.cameras)
-    return tuple(focal_contradictions(cameras.values(), records, lines))
+    return tuple(focal_contradictions(cameras.values(), records, line_cameras))
 
 
 def contradiction_text(found: FocalContradiction) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.escalation.escalate import matched_again
+from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.report import (
     ModelSummary,
     StageReport,
@@ -67,9 +67,10 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
     missing = unregistered(context, result.names, result.models, pair_inliers)
     cameras = cameras_of_report(workspace, result.models, result.extended)
-    lines: dict[str, LineReport] = {}
+    stored_lines: dict[str, Lines] = {}
     if not workspace.is_foreign:
-        lines = lines_of_report(context.features, result.names)
+        stored_lines = context.features.lines_of(result.names)
+    lines = lines_of_report(context.features, stored_lines)
     again = matched_again(context)
     report = RunReport(
         output_path=workspace.path,
@@ -87,7 +88,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         photographs=photographs_of_report(
             workspace, result.names, result.models, cameras, lines
         ),
-        focal_contradictions=contradictions_of_report(context),
+        focal_contradictions=contradictions_of_report(context, stored_lines),
         extended=tuple(result.extended),
         advice=advice(
             context,

@@ -66,14 +66,15 @@ def turn_upright(model: pycolmap.Reconstruction, upright: Upright) -> None:
 
 
 def _upright(model: pycolmap.Reconstruction, features: FeatureStore) -> Upright | None:
-    known = set(features.names())
+    images = _registered(model)
+    lines_of_images = features.lines_of(image.name for image in images)
     held = []
     names = []
     directions = []
-    for image in _registered(model):
+    for image in images:
         axes = _axes(image)
         held.append(-axes[:, 1])
-        lines = features.lines(image.name) if image.name in known else None
+        lines = lines_of_images.get(image.name)
         up = (
             None
             if lines is None

@@ -125,14 +125,15 @@ def line_cameras(context: Context) -> dict[str, LineCamera]:
 
     None of photographs whose focal length is known, nor of those that have hardly any lines.
     """
-    found = dict[str, LineCamera]()
+    names = list[str]()
     for record in read_camera_records(context.workspace.cameras).values():
-        names = record.names if record.source == "guess" else ()
-        for name in names:
-            lines = context.features.lines(name)
-            camera = lines.camera() if lines else None
-            if camera:
-                found[name] = camera
+        if record.source == "guess":
+            names.extend(record.names)
+    found = dict[str, LineCamera]()
+    for name, lines in context.features.lines_of(names).items():
+        camera = lines.camera()
+        if camera:
+            found[name] = camera
     return found
 
 

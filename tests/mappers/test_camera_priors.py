@@ -12,6 +12,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.geometry import lines
 from colmap_affrect.geometry.lines import MIDDLE_SIGMA, SHIFTED_SIGMA, LineCamera
+from colmap_affrect.mappers import camera_priors as module
 from colmap_affrect.mappers.camera_priors import (
     EXIF_SIGMA,
     LINES_SIGMA,
@@ -22,6 +23,7 @@ from colmap_affrect.mappers.camera_priors import (
     LogNormal,
     Measurement,
     camera_prior,
+    camera_priors,
     focal_contradictions,
     measurement_of_lines,
     product,
@@ -91,6 +93,22 @@ def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> 
     assert camera_prior(camera(), exif, said) == CameraPrior(1200.0, EXIF_SIGMA)
     given = replace(NOTHING, source="given", given=("focal",))
     assert camera_prior(camera(), given, said) == CameraPrior(1200.0, 0.0)
+
+
+def test_the_prior_of_a_camera_of_many_images_is_made_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked_at = []
+    by_number = {f"{number}.jpg": by_lines(0.9) for number in range(50)}
+    shared = CameraRecord(tuple(by_number), "guess", 1200.0, size=SIZE)
+
+    def look(lines_of_image: LineCamera) -> Measurement | None:
+        looked_at.append(lines_of_image)
+        return measurement_of_lines(lines_of_image)
+
+    monkeypatch.setattr(module, "measurement_of_lines", look)
+    camera_priors([camera()] * 50, {1: shared}, by_number)
+    assert len(looked_at) == 50
 
 
 def test_without_lines_models_begin_with_lenses_from_wide_to_long() -> None:
