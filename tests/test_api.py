@@ -323,7 +323,7 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(
     assert NAMES[0] not in page, "names are no markup"
     text = Text(page).words
     assert text[0] == "4 of 6 photographs registered"
-    pairs = dict(pairwise(text))
+    pairs = dict(reversed([*pairwise(text)]))  # the first one of each word
     shown = {
         key: pairs[key]
         for key in ("verified pairs", "sure", "unsure", "doubtful", "points")

@@ -300,7 +300,7 @@ def _print_reconstruction(
         show("\n".join(_next_steps(report, workspace)))
     why = report.why_no_model
     if report.status == "doubtful":
-        why = "nothing in the model can be trusted"
+        why = "nothing in the model can be trusted: it is doubtful throughout, but written"
     if why:
         where = workspace.page if workspace.page.exists() else workspace.report
         raise NoModelError(f"{why}; see {where}")

@@ -51,8 +51,8 @@ ENDING = """
 What computes goes on where it stopped when it is run again. Exit codes: 0 done; 1 failed (one
 line says why; also when images could not be read, see --max-failures); 2 not carried out as it was
 given: unknown options and values, a file or folder that is not there, a list or table that is
-wrong, results of yours or of other options in the way; 3 finished without a model that can be
-trusted; 130 interrupted (143 by SIGTERM).
+wrong, results of yours or of other options in the way; 3 finished without a model, or with one
+that is doubtful throughout, which is written all the same; 130 interrupted (143 by SIGTERM).
 """
 
 

@@ -158,6 +158,13 @@ def _num_sure(seed: SeedResult) -> float | None:
     return None if seed.scores else len(seed.sure)
 
 
+def _num_unsure(seed: SeedResult) -> float | None:
+    """Return how many images are neither sure nor doubtful, where no truth tells more."""
+    if seed.scores:
+        return None
+    return len(seed.registered_names) - len(seed.sure) - len(seed.doubtful)
+
+
 def _num_doubtful(seed: SeedResult) -> float | None:
     return None if seed.scores else len(seed.doubtful)
 
@@ -166,6 +173,7 @@ MEASURES = {
     "registered": Measure("registered", lambda seed: len(seed.registered_names)),
     "correct": Measure("correct", _num_correct),
     "num_sure": Measure("sure", _num_sure),
+    "num_unsure": Measure("unsure", _num_unsure),
     "num_doubtful": Measure("doubtful", _num_doubtful),
     "verified_pairs": Measure("pairs", lambda seed: seed.verified_pairs),
     "points3D": Measure(title="points", value=_of_model("points3D"), digits=0),

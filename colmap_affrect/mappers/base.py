@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from colmap_affrect.geometry.lines import LineCamera
     from colmap_affrect.mappers.existing import ExistingModel
     from colmap_affrect.mappers.pair_graph import PairGraph
+    from colmap_affrect.project.reasons import Doubt
     from colmap_affrect.project.report import Bridge
 
 
@@ -128,6 +129,10 @@ class MappedModel:
     axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
     """By the names of images: how far rotations change where principal points that points
     contradict are freed, though that makes no better model."""
+    apart: Mapping[str, Doubt] = field(default_factory=dict)
+    """By the names of images that were in the same model, why they are not in this one."""
+    motion_share: float = 1.0
+    """Share of what moves as the model says, before cameras were freed, which may hide the rest."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
 

@@ -1,16 +1,20 @@
-"""Groups of photographs that match each other, and that no model has: each becomes one of its own.
+"""Models of groups of photographs: of those that no model has, and of each place of several.
 
 A search ends once first pairs bring nothing that scores higher than its best model, which a second
 group of photographs never does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 
 from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search
+from colmap_affrect.mappers.surroundings import Places, places_of
+from colmap_affrect.project.reasons import Doubt, DoubtCode
 
+MIN_PLACE = 2  # photographs that make a model; theory
 MIN_GROUP = 3  # photographs: two alone are hardly ever sure, and COLMAP keeps three
 
 
@@ -38,6 +42,87 @@ def with_other_groups(
         found += [mapped for mapped in own if _num_images(mapped) >= MIN_GROUP]
         group = _largest_group(search.graph, found, tried)
     return found
+
+
+def with_places_mapped_again(
+    models: Sequence[MappedModel],
+    graph: PairGraph,
+    map_again: Callable[[PairGraph], list[MappedModel]],
+) -> list[MappedModel]:
+    """Return models of one place each: a model of several bends all to fit what is false.
+
+    Args:
+        models: The models so far.
+        graph: Their pairs.
+        map_again: Makes models of some of the pairs.
+
+    Returns:
+        The models. Where one holds several places, its largest place is mapped again alone, without
+        collages, and then all photographs that are in no model so far; it stays as it is where that
+        place makes no model.
+    """
+    found = list[MappedModel]()
+    inside = set[int]()
+    why_apart = dict[str, Doubt]()
+    todo = list(models)
+    while todo:
+        mapped = todo.pop(0)
+        places = places_of(mapped.reconstruction, graph)
+        made = _largest_place_alone(places, graph, map_again)
+        found.append(made or mapped)
+        inside.update(found[-1].reconstruction.reg_image_ids())
+        if made:
+            why_apart.update(_why_apart(places, graph))
+            inside |= places.collages
+            todo = map_again(_inside(graph, graph.names.keys() - inside))
+    return [_with_why_apart(mapped, why_apart) for mapped in found]
+
+
+def _largest_place_alone(
+    places: Places,
+    graph: PairGraph,
+    map_again: Callable[[PairGraph], list[MappedModel]],
+) -> MappedModel | None:
+    """Return a model of the largest of several places, without collages.
+
+    Args:
+        places: Of a model.
+        graph: The pairs.
+        map_again: Makes models of some of the pairs.
+
+    Returns:
+        The model; None where there is one place alone, or most of its photographs are in no model.
+    """
+    own = places.images[0] - places.collages
+    if len(places.images) < 2 or len(own) < MIN_PLACE:
+        return None
+    made = map_again(_inside(graph, own))
+    is_good = made and 2 * _num_images(made[0]) > len(own)
+    return made[0] if is_good else None
+
+
+def _inside(graph: PairGraph, image_ids: Set[int]) -> PairGraph:
+    """Return the graph of the pairs of some images."""
+    outside = [pair.ids for pair in graph.verified if not image_ids >= {*pair.ids}]
+    return graph.without(outside)
+
+
+def _why_apart(places: Places, graph: PairGraph) -> dict[str, Doubt]:
+    """Return why each image of several places is not in a model of another one, by name."""
+    found = dict[str, Doubt]()
+    for image_id in sorted(set[int]().union(*places.images)):
+        is_collage = image_id in places.collages
+        code: DoubtCode = "two_places" if is_collage else "other_surroundings"
+        found[graph.names[image_id]] = Doubt(code)
+    return found
+
+
+def _with_why_apart(mapped: MappedModel, why_apart: Mapping[str, Doubt]) -> MappedModel:
+    """Return a model with the reasons of the images that it does not have."""
+    model = mapped.reconstruction
+    own = {model.images[image_id].name for image_id in model.reg_image_ids()}
+    others = {name: why for name, why in why_apart.items() if name not in own}
+    return replace(mapped, apart=others)
 
 
 def _num_images(mapped: MappedModel) -> int:

@@ -25,6 +25,7 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
+from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     MIN_SHARE,
@@ -248,10 +249,14 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
     """
     graph = graph_of(task, MIN_NUM_MATCHES)
     if task.extend or task.tie_points or graph.has_rigs:
-        return [_without_wrong_images(mapped, task)]
+        whole = _without_wrong_images(mapped, task)
+        _doubt_motion(whole, task)
+        return [whole]
     places = places_of(mapped.reconstruction, graph)
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
+    for name, doubt in mapped.apart.items():
+        scored.taken_out[name] = Confidence(0.0, (doubt,))
     found = [scored]
     for other in others:
         names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
@@ -260,18 +265,39 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
         if len(names) > 1:
             found.append(_without_wrong_images(other, task))
     for model in found:
+        _doubt_motion(model, task)
         for image_id in places.collages:
-            _doubt_collage(model, graph.names[image_id])
+            _doubt(model, graph.names[image_id], 0.5, Doubt("two_places"))
+        for image_id, share in places.unclear.items():
+            _doubt(model, graph.names[image_id], share, Doubt("other_surroundings"))
     return found
 
 
-def _doubt_collage(model: _ScoredModel, name: str) -> None:
-    """Halve the probability of an image that is as likely of another place, if it is there."""
+def _doubt_motion(model: _ScoredModel, task: MappingTask) -> None:
+    """Doubt a model where something moves in another way: that may be the scene as well."""
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    found = share_of_motion(model.mapped.reconstruction, graph)
+    share = min(found, model.mapped.motion_share)
+    if share < 1.0:
+        doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})
+        for name in list(model.confidences):
+            _doubt(model, name, share, doubt)
+
+
+def _doubt(model: _ScoredModel, name: str, share: float, doubt: Doubt) -> None:
+    """Multiply the probability of an image, if it is there.
+
+    Args:
+        model: Is changed.
+        name: Of the image.
+        share: Factor of the probability.
+        doubt: The reason.
+    """
     known = model.confidences.get(name)
     if known:
-        reasons = (Doubt("two_places"), *known.reasons)[:NUM_REASONS]
+        reasons = (doubt, *known.reasons)[:NUM_REASONS]
         model.confidences[name] = replace(
-            known, probability=known.probability / 2, reasons=reasons
+            known, probability=share * known.probability, reasons=reasons
         )
 
 

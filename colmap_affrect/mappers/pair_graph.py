@@ -82,11 +82,19 @@ class RelativePose:
 
 
 @dataclass(frozen=True)
-class _Agreement:
-    """Which matches agree with a relative pose."""
+class Agreement:
+    """How well matches agree with a relative pose."""
 
-    agrees: Bools  # (M,)
+    errors_px: (
+        Array  # (M,) Sampson errors, infinite where no point in front explains a match
+    )
+    tolerance_px: float  # largest error of a match that agrees
     depths: Depths  # of all matches
+
+    @property
+    def agrees(self) -> Bools:
+        """Tell which matches agree."""
+        return self.errors_px <= self.tolerance_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +117,10 @@ class PairGraph:
     pairs: Pairs  # sorted by ids
     weak: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
+    raw_matches: dict[Ids, Indices] = field(default_factory=dict)
+    """Raw (M, 2) matches of the strongest pairs, where a database was read."""
+    shaped_keypoints: dict[int, Singles] = field(default_factory=dict)
+    """(N, 2, 4 or 6) by image id, of the same pairs, as the database has them."""
     _agreements: dict[Ids, _KnownAgreement] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -125,7 +137,13 @@ class PairGraph:
         """
         with open_database(path) as database:
             graph = cls.of(database, min_num_matches)
+            for pair in graph.pairs:
+                raw = np.asarray(database.read_matches(*pair.ids), np.int64)
+                graph.raw_matches[pair.ids] = raw.reshape(-1, 2)
             enough = {pair.ids: pair.matches for pair in graph.verified}
+            for image_id in graph.keypoints:
+                rows = database.read_keypoints(image_id)
+                graph.shaped_keypoints[image_id] = np.asarray(rows, np.float32)
             few = sure_few_matches(database, enough)
             return graph._with_few_matches(few, database) if few else graph
 
@@ -285,7 +303,7 @@ class PairGraph:
             return known.share
         pose = relative_pose(poses[first], poses[second])
         share = float(
-            _compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
+            compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
         )
         self._agreements[pair.ids] = _KnownAgreement(pair, asked, share)
         return share
@@ -334,7 +352,7 @@ class PairGraph:
         both = cameras[pair.ids[0]], cameras[pair.ids[1]]
         allowed = list[RelativePose]()
         for pose in self._candidate_poses(pair, both, random_seed):
-            found = _compared_with_pose(pose, both, self.points(pair))
+            found = compared_with_pose(pose, both, self.points(pair))
             has_depth = found.agrees & (found.depths.angles_deg > MIN_ANGLE_DEG)
             if found.agrees.mean() >= MIN_SHARE and has_depth.any():
                 depths = found.depths.first[has_depth], found.depths.second[has_depth]
@@ -443,9 +461,9 @@ def sampling_step(num_items: int, max_num: int) -> int:
     return max(1, math.ceil(num_items / max_num))
 
 
-def _compared_with_pose(
+def compared_with_pose(
     pose: Pose, cameras: Cameras, points: tuple[Array, Array]
-) -> _Agreement:
+) -> Agreement:
     """Compare matches with a relative pose.
 
     Args:
@@ -468,7 +486,8 @@ def _compared_with_pose(
     longer_sides = [max(camera.width, camera.height) for camera in cameras]
     tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * side for side in longer_sides))
     is_possible = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
-    return _Agreement((errors <= tolerance) & is_possible, depths)
+    errors = np.where(is_possible, errors, np.inf)
+    return Agreement(errors, tolerance, depths)
 
 
 def _read_pairs(

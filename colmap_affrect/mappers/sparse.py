@@ -15,9 +15,10 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
 from colmap_affrect.mappers.final_points import complete_points
-from colmap_affrect.mappers.groups import with_other_groups
+from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
+from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
@@ -144,21 +145,45 @@ class SparseMapper(IncrementalMapper):
         Images of one size share uncalibrated cameras at first. Cameras of their own are one more
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
-        per_image = self._search(task, graph, native, show)
         bare = replace(task, image_path=None, snapshot_path=None)
         by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
+        best = self._tested(task, graph, native, show, by_colmap)
+
+        def map_again(some: PairGraph) -> list[MappedModel]:
+            return self._tested(task, some, native, show, list)
+
+        if not (task.tie_points or task.previous_models or graph.has_rigs):
+            best = with_places_mapped_again(best, graph, map_again)
+        for mapped in best:
+            if not has_rigs(mapped.reconstruction):  # which tell the scale
+                mapped.reconstruction.normalize()  # as COLMAP does
+        return self._with_last_points(best, task, graph, native)
+
+    def _tested(
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
+        show: Callable[[int], None],
+        by_colmap: Callable[[], list[MappedModel]],
+    ) -> list[MappedModel]:
+        """Return the models of the best hypothesis.
+
+        Args:
+            task: What to map.
+            graph: The pairs that models are made from.
+            native: Options.
+            show: Called with the number of images of a model.
+            by_colmap: Returns the models that COLMAP's own mapper makes.
+        """
+        per_image = self._search(task, graph, native, show)
         best = list[MappedModel]()
         cameras = with_shared_cameras(task.cameras) if task.may_share else task.cameras
         if len(cameras) < len(task.cameras):
             sharing = replace(task, cameras=cameras)
             shared = self._search(sharing, graph.with_cameras(cameras), native, show)
             best = _HypothesisTest(task, shared, per_image, by_colmap).run()
-        if not best:
-            best = _HypothesisTest(task, per_image, None, by_colmap).run()
-        for mapped in best:
-            if not has_rigs(mapped.reconstruction):  # which tell the scale
-                mapped.reconstruction.normalize()  # as COLMAP does
-        return self._with_last_points(best, task, graph, native)
+        return best or _HypothesisTest(task, per_image, None, by_colmap).run()
 
     def _with_last_points(
         self,
@@ -385,8 +410,10 @@ class _HypothesisTest:
         if free is None or not contradict_held(model, search, free):
             return
         changed = with_shifted_axes(model, free, search.graph)
+        share = self._motion_share(self.best[0])
         changed_model = _also_by(
-            SHIFTED_AXES, replace(self.best[0], reconstruction=changed)
+            SHIFTED_AXES,
+            replace(self.best[0], reconstruction=changed, motion_share=share),
         )
         found = free.with_bridges(search.graph, [changed_model])
         found = with_new_images([*found, *self.best[1:]])
@@ -413,11 +440,20 @@ class _HypothesisTest:
             or self.per_image.scorer.score(model) <= self.score + MIN_SCORE_GAIN
         ):
             return
-        changed = _also_by(PER_IMAGE_CAMERAS, replace(first, reconstruction=model))
+        share = self._motion_share(first)
+        changed = _also_by(
+            PER_IMAGE_CAMERAS,
+            replace(first, reconstruction=model, motion_share=share),
+        )
         self.best = with_new_images([changed, *self.best[1:]])
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
+
+    def _motion_share(self, mapped: MappedModel) -> float:
+        """Return the share of what moves as a model says: other cameras may hide the rest."""
+        found = share_of_motion(mapped.reconstruction, self.search.graph)
+        return min(found, mapped.motion_share)
 
 
 def _extract_colors(

@@ -8,6 +8,7 @@ from a similar direction and has no surface of its own before it.
 """
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -19,9 +20,9 @@ from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.model_score import (
-    CHANCE,
     GRID,
     RIGHT_PAIR,
+    Beta,
     beta_log_ratio,
     grid_cells,
 )
@@ -41,13 +42,15 @@ MAX_NUM_PAIRS = 1000  # of a model: larger ones are not looked at; resource
 CONTRADICTED = -6.0
 """Log-likelihood ratio of one place against two, below which parts are two places: twenty to one,
 where one place is twenty times as probable beforehand (theory)."""
+TIED = 1.5  # of a pair: as much as about ten cells tell that are all found (theory)
+ONE_PLACE = 3.0  # log odds beforehand of one place, twenty to one (theory)
 # Share of the cells of the smaller region that two regions share; judged
 MAX_COMMON = 0.1
 MIN_EXPECTED = 8  # cells, an eighth of a photograph: less tells nothing (judged)
-# Shares of expected cells that are found. Measured: 0.85 to 1 of pairs of true scenes, seldom 0.6;
-# 0.22 to 0.54 of pairs that a poster ties
+# Shares of expected cells that are found. Measured: 0.85 to 1 of pairs of true scenes, seldom 0.6.
+# A poster or a statue in two places may take any share: 0.22 to 0.54, and 0.55 to 0.8 (theory)
 SAME_PLACE = RIGHT_PAIR
-OTHER_PLACE = CHANCE
+OTHER_PLACE = Beta(1.0, 1.0)  # any share is as probable as another one (theory)
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,8 @@ class Places:
     images: list[set[int]]
     collages: set[int] = field(default_factory=set)
     """Images of two places: one region matches one of them, another one the other."""
+    unclear: dict[int, float] = field(default_factory=dict)
+    """Probability, by image, that it is of the place of others that it is taken for."""
 
 
 def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
@@ -252,46 +257,76 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
     overlaps = {pair.ids: views.overlap(*pair.ids) for pair in pairs}
     tied = list[Ids]()
     for ids, one in overlaps.items():
-        if one.tells and one.log_ratio >= 0.0:
+        if one.tells and one.log_ratio >= TIED:
             tied.append(ids)
-    merged = _merged(connected_parts(tied, images), overlaps)
     found = Places([])
+    merged = _merged(connected_parts(tied, images), overlaps, found.unclear)
     for place in merged:
         found.images += _cut_at_collages(place, overlaps, views, found.collages)
     found.images.sort(key=lambda part: (-len(part), min(part)))
     return found
 
 
+@dataclass(frozen=True)
+class _Merger:
+    """Two parts that pairs tie."""
+
+    log_ratio: float  # of one place against two
+    first: set[int]
+    second: set[int]
+
+
 def _merged(
-    parts: Sequence[set[int]], overlaps: Mapping[Ids, Overlap]
+    parts: Sequence[set[int]],
+    overlaps: Mapping[Ids, Overlap],
+    unclear: dict[int, float],
 ) -> list[set[int]]:
     """Merge parts unless the surroundings of the pairs between them contradict that.
 
     Args:
         parts: Of images.
         overlaps: By pair.
+        unclear: Gets the images of smaller parts of which that is not clear.
     """
     left = list(parts)
-    pair = _mergeable(left, overlaps)
-    while pair:
-        left = [part for part in left if part not in pair]
-        left.append(pair[0] | pair[1])
-        pair = _mergeable(left, overlaps)
+    merger = _best_merger(left, overlaps)
+    while merger:
+        first = merger.first
+        second = merger.second
+        if merger.log_ratio < -ONE_PLACE:  # two places are more likely
+            probability = 1.0 / (1.0 + math.exp(-merger.log_ratio - ONE_PLACE))
+            for image_id in _not_larger(first, second):
+                unclear[image_id] = min(probability, unclear.get(image_id, 1.0))
+        left = [part for part in left if part not in (first, second)]
+        left.append(first | second)
+        merger = _best_merger(left, overlaps)
     return left
 
 
-def _mergeable(
+def _not_larger(first: set[int], second: set[int]) -> set[int]:
+    """Return the images of the smaller part, of both where they are equal."""
+    if len(first) == len(second):
+        return first | second
+    return min(first, second, key=len)
+
+
+def _best_merger(
     parts: Sequence[set[int]], overlaps: Mapping[Ids, Overlap]
-) -> tuple[set[int], set[int]] | None:
-    """Return two parts that pairs tie and no surroundings contradict."""
+) -> _Merger | None:
+    """Return the two parts that are most likely of one place, if any are not contradicted."""
+    best = None
+    highest = CONTRADICTED
     for first, second in combinations(parts, 2):
         between = list[Overlap]()
         for ids, one in overlaps.items():
             if not first.isdisjoint(ids) and not second.isdisjoint(ids):
                 between.append(one)
-        if between and _joint_log_ratio(between) >= CONTRADICTED:
-            return first, second
-    return None
+        log_ratio = _joint_log_ratio(between)
+        is_better = log_ratio > highest or (best is None and log_ratio == highest)
+        if between and is_better:
+            highest = log_ratio
+            best = _Merger(log_ratio, first, second)
+    return best
 
 
 def _joint_log_ratio(overlaps: Sequence[Overlap]) -> float:

@@ -24,6 +24,7 @@ DoubtCode = Literal[
     "other_surroundings",
     "two_places",
     "hangs_on",
+    "something_moves",
 ]
 
 SENTENCES: dict[DoubtCode, str] = {
@@ -58,6 +59,10 @@ SENTENCES: dict[DoubtCode, str] = {
     ),
     "two_places": "it alone ties two places, each by another part of it, as a collage does",
     "hangs_on": "it hangs on {other}, which is right with a probability of {percent}% itself",
+    "something_moves": (
+        "something moves as one between photographs, against the rest: {percent}% of what they "
+        "show moves as the model says"
+    ),
 }
 """What to say of each; the numbers in braces are the values of the doubt."""
 

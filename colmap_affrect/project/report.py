@@ -256,6 +256,18 @@ class ModelSummary:
         """Names of the images that are rather right than wrong."""
         return set(self.registered_names) - self.doubtful.keys()
 
+    def class_counts(self) -> dict[str, int]:
+        """Return how many photographs are sure, unsure and doubtful."""
+        num_sure = len(self.sure)
+        num_doubtful = len(self.doubtful)
+        num_unsure = len(self.registered_names) - num_sure - num_doubtful
+        return {"sure": num_sure, "unsure": num_unsure, "doubtful": num_doubtful}
+
+    def classes_text(self) -> str:
+        """Return these numbers, the sure ones first."""
+        counts = self.class_counts()
+        return f"{counts['sure']}, unsure {counts['unsure']}, doubtful {counts['doubtful']}"
+
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
         bridges = self.bridges.items()
@@ -263,7 +275,7 @@ class ModelSummary:
         doubtful = by_story(texts_of(self.doubtful))
         alike = [f"{first} and {second}" for first, second in self.one_view]
         return [
-            f"sure        {len(self.sure)}, right with a probability of {SURE:.0%} or more",
+            f"sure        {self.classes_text()}; sure: right with {SURE:.0%} or more",
             *_some(f"joined      {name} {bridge.text()}" for name, bridge in bridges),
             *_some(f"unsure      {line}" for line in unsure),
             *_some(f"doubtful    {line}" for line in doubtful),
@@ -495,6 +507,8 @@ class ReconstructionReport(Summarized):
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines.append(f"models      {len(self.models)}, of {sizes} images")
+        for number, model in enumerate(self.models[1:MAX_LINES], 1):
+            lines.append(f"            sparse/{number}: sure {model.classes_text()}")
         return lines
 
     def _preset_lines(self) -> list[str]:

@@ -52,6 +52,13 @@ class _Case:
         of_images = [*self.model.doubtful.values(), *self.model.taken_out.values()]
         return list(itertools.chain.from_iterable(of_images))
 
+    @property
+    def moves(self) -> bool:
+        """Whether something moves between the photographs of the model."""
+        of_images = [*self.model.doubtful.values(), *self.model.unsure.values()]
+        doubts = itertools.chain.from_iterable(of_images)
+        return any(doubt.code == "something_moves" for doubt in doubts)
+
     def has_doubt(self, codes: Collection[DoubtCode]) -> bool:
         """Return whether an image is doubted for one of some reasons."""
         return any(doubt.code in codes for doubt in self.doubts)
@@ -109,7 +116,7 @@ def advice(
         if _share_without_depth(context) < MIN_SHARE_WITHOUT_DEPTH:
             why = "more photographs between these: matches show depth, but contradict each other"
         return (*found, Advice(why))
-    if lost or case.doubts:
+    if lost or case.doubts or case.moves:
         for rule in RULES:
             found += rule(case)
     return tuple(found)
@@ -208,7 +215,7 @@ def _of_masks(case: _Case) -> list[Advice]:
     inputs = case.inputs
     if not (inputs and inputs.masks == MaskOptions()):
         return []
-    if not case.has_doubt(CONTRADICTED):
+    if not (case.moves or case.has_doubt(CONTRADICTED)):
         return []
     why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
     return [Advice(why, _anew(case.context, "--mask-path", "masks"))]

@@ -20,13 +20,14 @@ from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.reasons import text_of
 from colmap_affrect.project.report import (
     MAX_LINES,
+    NO_MODEL,
     SOURCES,
     ModelSummary,
     ReconstructionReport,
 )
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.photographs import PhotographReport
+from colmap_affrect.report.photographs import PhotographReport, quality_of
 from colmap_affrect.session.context import Context
 
 MAX_ROWS = 200  # photographs in the table of a notebook; report.json has all
@@ -98,11 +99,8 @@ class RunReport(ReconstructionReport):
         }
         if self.models:
             model = self.models[0]
-            unsure = len(model.registered_names) - len(model.sure) - len(model.doubtful)
             counts |= {
-                "sure": f"{len(model.sure)}",
-                "unsure": f"{unsure}",
-                "doubtful": f"{len(model.doubtful)}",
+                **{key: f"{num}" for key, num in model.class_counts().items()},
                 "points": f"{model.num_points3D:,}",
                 "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
             }
@@ -122,16 +120,18 @@ class RunReport(ReconstructionReport):
     def _photographs(self) -> str:
         """Return a folded table of the photographs and what became of each."""
         rows = []
-        model = self.models[0] if self.models else None
+        model = self.models[0] if self.models else NO_MODEL
         for name in self.registered_names:
-            chance = model.probabilities.get(name) if model else None
+            chance = model.probabilities.get(name)
             percent = "" if chance is None else f"{chance:.0%}"
-            why = text_of(model.doubtful.get(name, ())) if model else ""
+            doubts = (*model.doubtful.get(name, ()), *model.unsure.get(name, ()))
+            quality = quality_of(name, model)
+            why = f"{quality}: {text_of(doubts)}" if doubts else quality
             rows.append(
                 [
                     _text(name),
                     percent,
-                    _text(f"doubtful: {why}" if why else "registered"),
+                    _text(why),
                 ]
             )
         rows += [

@@ -84,15 +84,13 @@ def _headline(num: int, counts: Mapping[Quality, int], num_models: int) -> str:
     models = f", in {num_models} models" if num_models > 1 else ""
     if num_sure == num:
         return f"All {num} photographs are placed surely{models}"
-    if not num_sure:
-        return (
-            f"{num_placed} of {num} photographs are placed, none of them surely{models}"
-        )
     others = []
     for quality, count in counts.items():
         if quality != "sure":
             others.append(f"{count} {QUALITIES[quality]}")
     text = f"{num_sure} of {num} photographs are placed surely, {', '.join(others)}"
+    if not num_sure:
+        text = f"None of {num} photographs is placed surely, {', '.join(others)}"
     return f"{text}; {num_models} models" if num_models > 1 else text
 
 

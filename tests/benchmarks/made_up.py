@@ -1,9 +1,11 @@
 r"""Sets of photographs in which something false ties them, from scenes whose poses are known.
 
 Kinds: `poster`, the same print in two places; `posters`, three prints; `collage`, photographs of
-two places side by side; `elsewhere`, a print of one place in photographs of another one; `moving`,
-a surface that flows on from photograph to photograph, before a scene that stays; `true`, none of
-this. A print is drawn as a board that stands in the scene, in right perspective. Usage:
+two places side by side; `elsewhere`, a print of one place in photographs of another one; `statue`,
+the same rough surface in two places; `tower`, a box whose four sides are the same; `moving`, a
+surface that flows on from photograph to photograph, before a scene that stays; `drifting`, a rough
+surface that travels as one, as ice does; `true`, none of this. A print is drawn as a board that
+stands in the scene, in right perspective. Usage:
 
     python tests/benchmarks/made_up.py make OUT --kind poster --first SCENE --second SCENE \
         --print JPG
@@ -33,9 +35,24 @@ from colmap_affrect.project.report import SURE
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
-KINDS = ("poster", "posters", "collage", "elsewhere", "moving", "true")
+KINDS = (
+    "poster",
+    "posters",
+    "collage",
+    "elsewhere",
+    "statue",
+    "tower",
+    "moving",
+    "drifting",
+    "true",
+)
+NUM_STRIPS = 6  # of a rough surface
+ROUGHNESS = (
+    0.12  # of the distance of a rough surface, that its strips are apart in depth
+)
 TRUTH = "truth.json"
 MAX_ERROR_DEG = 5.0
+SAME_PLACE = 1e-6  # of the units of a scene: nothing tells a direction
 
 
 @dataclass
@@ -149,6 +166,95 @@ def draw(shot: Shot, board: Board, print_: Picture, flow: float = 0.0) -> None:
     shot.picture = (soft * warped + (1.0 - soft) * shot.picture).astype(np.uint8)
 
 
+def strips_of(board: Board, viewer: Array) -> list[Board]:
+    """Cut a board into strips one above the other, every other one farther away."""
+    found = []
+    for index in range(NUM_STRIPS):
+        place = (2 * index + 1) / NUM_STRIPS - 1.0
+        middle = board.middle + place * board.down
+        farther = 1.0 + ROUGHNESS * (index % 2)
+        found.append(
+            Board(
+                viewer + farther * (middle - viewer),
+                farther * board.right,
+                farther * board.down / NUM_STRIPS,
+            )
+        )
+    return found
+
+
+def draw_solid(
+    shots: list[Shot], print_: Picture, arguments: argparse.Namespace
+) -> None:
+    """Draw what is no board: a tower, or a rough surface."""
+    if arguments.kind == "tower":
+        draw_tower(shots, print_, arguments.share)
+    else:
+        draw_rough(shots, print_, arguments)
+
+
+def draw_rough(
+    shots: list[Shot], print_: Picture, arguments: argparse.Namespace
+) -> None:
+    """Draw a rough surface, which may travel as one from photograph to photograph.
+
+    Args:
+        shots: Of a scene, in the order of time.
+        print_: What the surface shows.
+        arguments: Its share, place, and how far it travels in how many photographs.
+    """
+    board = board_before(shots, arguments.share, 0.0)
+    width = 2.0 * board.right / arguments.share
+    height = 2.0 * board.down / arguments.share
+    board.middle += arguments.below * height
+    viewer = np.mean([shot.center for shot in shots], axis=0)
+    depth = board.middle - viewer
+    strips = strips_of(board, viewer)
+    rows = np.array_split(np.arange(print_.shape[0]), NUM_STRIPS)
+    for step, shot in enumerate(shots):
+        time = step * arguments.times // len(shots)
+        if arguments.times == 1:
+            time = step // arguments.still_for
+        right, down, ahead = arguments.travel
+        if arguments.kind == "statue":
+            time = 0
+        way = time * (right * width + down * height + ahead * depth)
+        for index in (1, 3, 5, 0, 2, 4):  # what is farther away first
+            moved = Board(
+                strips[index].middle + way, strips[index].right, strips[index].down
+            )
+            draw(shot, moved, print_[rows[index]])
+
+
+def draw_tower(shots: list[Shot], print_: Picture, share: float) -> None:
+    """Draw a box whose four sides show the same.
+
+    Args:
+        shots: Of a scene.
+        print_: What each side shows.
+        share: Of the width of photographs that a side takes.
+    """
+    front = board_before(shots, share, 0.0)
+    up = front.down / np.linalg.norm(front.down)
+    radius = float(np.linalg.norm(front.right))
+    viewer = np.mean([shot.center for shot in shots], axis=0)
+    ahead = np.cross(front.right / radius, up)
+    ahead *= np.sign(ahead @ (front.middle - viewer))
+    middle = front.middle + radius * ahead
+    sides = []
+    for normal, right in (
+        (-ahead, front.right),
+        (front.right / radius, radius * ahead),
+        (ahead, -front.right),
+        (-front.right / radius, -radius * ahead),
+    ):
+        sides.append((normal, Board(middle + radius * normal, right, front.down)))
+    for shot in shots:
+        for normal, board in sides:
+            if normal @ (shot.center - board.middle) > 0.0:
+                draw(shot, board, print_)
+
+
 def read_print(path: Path, size_px: int) -> Picture:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     scale = size_px / max(picture.shape[:2])
@@ -168,9 +274,17 @@ def side_by_side(first: Picture, second: Picture) -> Picture:
 
 
 def change(
-    kind: str, groups: dict[str, list[Shot]], prints: list[Picture], share: float
+    groups: dict[str, list[Shot]], prints: list[Picture], arguments: argparse.Namespace
 ) -> dict[str, Picture]:
     """Draw what is false into photographs; return photographs that belong to no group."""
+    kind = arguments.kind
+    share = arguments.share
+    if kind == "true":
+        return {}
+    if kind in ("drifting", "statue", "tower"):
+        for shots in groups.values():
+            draw_solid(shots, prints[0], arguments)
+        return {}
     if kind == "collage":
         pictures = [shots[0].picture for shots in groups.values()]
         return {"collage.jpg": side_by_side(*pictures)}
@@ -197,16 +311,16 @@ def make(arguments: argparse.Namespace) -> None:
     scenes = {"a": (arguments.first, arguments.of_first)}
     if arguments.second:
         scenes["b"] = (arguments.second, arguments.of_second)
-    groups = {}
+    groups: dict[str, list[Shot]] = {}
     for group, (scene, chosen) in scenes.items():
         numbers = slice(*[int(part) if part else None for part in chosen.split(":")])
-        groups[group] = read_shots(scene, numbers, arguments.size_px)
+        groups[group] = []
+        for _ in range(arguments.times):  # from the same places once more
+            groups[group] += read_shots(scene, numbers, arguments.size_px)
     prints = [read_print(path, arguments.size_px) for path in arguments.print]
     if arguments.kind == "elsewhere":
         prints = [groups["a"][0].picture.copy()]
-    others = {}
-    if arguments.kind != "true":
-        others = change(arguments.kind, groups, prints, arguments.share)
+    others = change(groups, prints, arguments)
     truth: dict[str, Any] = {}
     for group, shots in groups.items():
         for number, shot in enumerate(shots):
@@ -214,7 +328,8 @@ def make(arguments: argparse.Namespace) -> None:
             cv2.imwrite(
                 str(images / name), shot.picture, [cv2.IMWRITE_JPEG_QUALITY, 93]
             )
-            truth[name] = [group, shot.rotation.tolist(), shot.translation.tolist()]
+            place = scenes[group][0].name  # two groups of one scene are one place
+            truth[name] = [place, shot.rotation.tolist(), shot.translation.tolist()]
     for name, picture in others.items():
         cv2.imwrite(str(images / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 93])
     (folder / TRUTH).write_text(json.dumps(truth), encoding="utf-8")
@@ -233,10 +348,13 @@ def wrong_names(folder: Path, truth: dict[str, Any]) -> set[str]:
             if other == name:
                 continue
             estimated = relative_pose(poses[name], poses[other])
-            true = [
+            poses_of_both = [
                 (np.array(truth[n][1]), np.array(truth[n][2])) for n in (name, other)
             ]
-            errors.append(max(pose_errors(estimated, relative_pose(*true))))
+            true = relative_pose(*poses_of_both)
+            of_both = pose_errors(estimated, true)
+            is_same_place = np.linalg.norm(true[1]) < SAME_PLACE
+            errors.append(of_both[0] if is_same_place else max(of_both))
         if errors and median(errors) > MAX_ERROR_DEG:
             wrong.add(name)
     return wrong
@@ -280,6 +398,22 @@ def main() -> None:
     )
     making.add_argument(
         "--share", type=float, default=0.4, help="of a board, of the width"
+    )
+    making.add_argument(
+        "--travel",
+        type=float,
+        nargs=3,
+        default=[0.08, 0.0, 0.0],
+        help="right, down (widths, heights of photographs) and ahead (of the distance)",
+    )
+    making.add_argument(
+        "--still-for", type=int, default=1, help="photographs between two travels"
+    )
+    making.add_argument(
+        "--times", type=int, default=1, help="that each place is photographed"
+    )
+    making.add_argument(
+        "--below", type=float, default=0.15, help="the middle, of the height"
     )
     making.add_argument("--size-px", type=int, default=640, help="longer side")
     making.set_defaults(run=make)

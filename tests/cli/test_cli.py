@@ -536,6 +536,7 @@ def test_model_that_nobody_can_trust_ends_with_3(
     assert "\nnext" not in printed.out
     assert ": few matches support its position\n" in printed.out
     assert printed.err.splitlines()[-1].startswith(
-        "error: nothing in the model can be trusted;"
+        "error: nothing in the model can be trusted: it is doubtful throughout, but written;"
     )
+    assert (verified / "sparse" / "0" / "images.bin").exists()
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

@@ -173,6 +173,7 @@ def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
     assert columns == {
         "registered": ["4.5 (4-5)", "3", "0"],
         "sure": ["4.5 (4-5)", "3", "0"],
+        "unsure": ["0", "0", "0"],
         "doubtful": ["0", "0", "0"],
         "pairs": ["50", "50", "50"],
         "points": ["900", "900", "-"],

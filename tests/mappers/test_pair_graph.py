@@ -115,13 +115,13 @@ def test_agreement_of_a_pair_is_computed_anew_where_a_pose_or_a_camera_is_anothe
     cameras = {key: copy.copy(camera) for key, camera in graph.cameras.items()}
     poses = {key: (np.eye(3), np.array([0.1 * key, 0.0, 1.0])) for key in cameras}
     computed = list[str]()
-    compute = pair_graph._compared_with_pose
+    compute = pair_graph.compared_with_pose
 
     def counting(*given: Any) -> Any:
         computed.append("")
         return compute(*given)
 
-    monkeypatch.setattr(pair_graph, "_compared_with_pose", counting)
+    monkeypatch.setattr(pair_graph, "compared_with_pose", counting)
     share = graph.agreement(pair, poses, cameras)
     assert graph.agreement(pair, dict(poses), cameras) == share
     assert len(computed) == 1

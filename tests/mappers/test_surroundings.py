@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
@@ -16,10 +17,11 @@ from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.groups import with_places_mapped_again
 from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
-from colmap_affrect.mappers.surroundings import places_of
+from colmap_affrect.mappers.surroundings import Overlap, _merged, places_of
 from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
@@ -183,3 +185,73 @@ def test_two_places_with_one_poster_are_two_models_and_each_says_why(
     assert {doubt.code for doubts in apart.values() for doubt in doubts} == {
         "other_surroundings"
     }
+
+
+def of_some(model: pycolmap.Reconstruction, image_ids: set[int]) -> MappedModel:
+    """A copy of a model with some of its images."""
+    found = copy.deepcopy(model)
+    for image_id in set(found.reg_image_ids()) - image_ids:
+        found.deregister_frame(found.images[image_id].frame_id)
+    return MappedModel(found)
+
+
+def test_places_are_mapped_again_each_by_its_own_pairs_and_without_a_collage(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    model = scene(path, nothing, collage=3)
+    asked = list[set[int]]()
+
+    def map_again(graph: PairGraph) -> list[MappedModel]:
+        asked.append({image_id for pair in graph.verified for image_id in pair.ids})
+        return [of_some(model, asked[-1])]
+
+    found = with_places_mapped_again(
+        [MappedModel(model)], PairGraph.read(path), map_again
+    )
+    assert asked == [{*THERE}, {1, 2}]
+    images = [set(mapped.reconstruction.reg_image_ids()) for mapped in found]
+    assert images == asked
+    why_not = {name: doubt.code for name, doubt in found[0].apart.items()}
+    assert why_not == {
+        "0.jpg": "other_surroundings",
+        "1.jpg": "other_surroundings",
+        "2.jpg": "two_places",
+    }
+
+
+def test_models_stay_where_a_place_alone_makes_none(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    whole = MappedModel(scene(path, poster))
+
+    def in_vain(_: PairGraph) -> list[MappedModel]:
+        return []
+
+    (found,) = with_places_mapped_again([whole], PairGraph.read(path), in_vain)
+    assert found.reconstruction is whole.reconstruction
+
+
+def test_a_model_of_one_place_is_not_mapped_again(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    whole = MappedModel(scene(path, everything))
+
+    def never(_: PairGraph) -> list[MappedModel]:
+        raise AssertionError
+
+    found = with_places_mapped_again([whole], PairGraph.read(path), never)
+    assert [mapped.reconstruction for mapped in found] == [whole.reconstruction]
+
+
+@pytest.mark.parametrize(
+    ("found", "unclear"),
+    [(28.0, set()), (16.0, {1, 2}), (22.0, set())],
+)
+def test_of_parts_that_are_rather_two_places_the_smaller_one_is_unclear(
+    found: float, unclear: set[int]
+) -> None:
+    overlaps = {(1, 3): Overlap(28.0, found), (2, 4): Overlap(28.0, found)}
+    probabilities = dict[int, float]()
+    merged = _merged([{1, 2}, {3, 4, 5}], overlaps, probabilities)
+    assert merged == [{1, 2, 3, 4, 5}]
+    assert set(probabilities) == unclear
+    assert all(probability < DOUBTFUL for probability in probabilities.values())

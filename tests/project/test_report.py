@@ -184,7 +184,8 @@ def test_summary_says_what_cannot_be_trusted() -> None:
         "doubtful    a.png: only 9 of its points are seen by two other photographs\n"
         in text
     )
-    assert "sure        1, right with a probability of 90% or more\n" in text
+    line = "sure        1, unsure 0, doubtful 1; sure: right with 90% or more\n"
+    assert line in text
 
 
 def test_summary_says_why_photographs_are_not_sure() -> None:
@@ -197,7 +198,8 @@ def test_summary_says_why_photographs_are_not_sure() -> None:
     )
     text = replace(REPORT, models=(two,)).summary()
     line = f"unsure      {names[0]}, {names[1]}: {why}"
-    assert f"sure        0, right with a probability of 90% or more\n{line}\n" in text
+    counts = f"sure        0, unsure {len(LARGE.registered_names)}, doubtful 0"
+    assert f"{counts}; sure: right with 90% or more\n{line}\n" in text
 
 
 def test_cameras_that_mapping_makes_one_are_said_to_be() -> None:

@@ -161,7 +161,7 @@ def test_shared_points_are_counted_for_each_pair(
 
 QUALITIES_AND_HEADLINES = [
     (["sure", "sure"], "All 2 photographs are placed surely"),
-    (["unsure", "doubtful"], "2 of 2 photographs are placed, none of them surely"),
+    (["unsure", "doubtful"], "None of 2 photographs is placed surely, 1 unsure, 1 doubtful"),
     (["sure", "sure", "missing"], "2 of 3 photographs are placed surely, 1 not placed"),
     (["missing", "missing"], "None of 2 photographs could be placed"),
 ]  # fmt: skip

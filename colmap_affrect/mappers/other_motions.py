@@ -1,0 +1,175 @@
+"""Whether something moves as one between photographs, against what their model says: ice, a crowd.
+
+A surface that moves has consistent matches, which contradict those of all that stays. Nothing in
+photographs tells which of both is the scene: the smaller a motion is, the less likely. Repeated
+structure has consistent matches that contradict a model, too, but other ones in each pair; what
+moves is the same surface again and again.
+"""
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import relative_pose
+from colmap_affrect.colmap.verification import (
+    Side,
+    VerificationOptions,
+    estimate_geometry,
+)
+from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.mappers.model_score import GRID
+from colmap_affrect.mappers.pair_graph import (
+    CameraById,
+    PairGraph,
+    PoseById,
+    VerifiedPair,
+    cameras_of,
+    compared_with_pose,
+    poses_of,
+)
+
+NUM_PAIRS = 6  # the strongest of each image that are looked at; resource
+MAX_NUM_PAIRS = 300  # of a model that are looked at, the strongest; resource
+FARTHER = 1.5
+"""Times the tolerance of matches that agree, from which on they contradict: between are those of
+poses and lenses that are not quite right (judged)."""
+MIN_CHAINED = 1.0 / 3.0
+"""Of the matches of another motion, the share that moves in another pair, too. Measured: 0.4 to
+0.95 of surfaces that were made to move, up to 0.2 of repeated windows and of wrong matches."""
+MIN_CELLS = 6
+"""Cells of another motion, a tenth of a photograph: lenses and poses that are a little off leave
+less, 1 to 5 of old prints (measured)."""
+MIN_SHOWING = 0.2
+"""Share of the pairs of a model that show another motion, where something moves: a quarter and more
+where surfaces were made to move, none of others (measured)."""
+MIN_NUM_SHOWING = 2  # of pairs: what one alone shows, nothing confirms; theory
+
+Features = Counter[tuple[int, int]]  # numbers of pairs, by image id and feature
+
+
+@dataclass(frozen=True)
+class _Motions:
+    """What of a pair moves as its model says, and what as one in another way."""
+
+    pair: VerifiedPair
+    sides: tuple[Side, Side]
+    own: Indices  # (M, 2) matches
+    other: Indices  # (K, 2) matches
+
+    def cells(self) -> Array:
+        """Return the numbers of cells that each of both has, the mean of both images.
+
+        A cell belongs to the motion with more matches in it.
+        """
+        counts = []
+        for index, side in enumerate(self.sides):
+            num_own = _in_cells(side, self.own[:, index])
+            num_other = _in_cells(side, self.other[:, index])
+            is_other = num_other > num_own
+            is_own = (num_own > 0) & ~is_other
+            counts.append([is_own.sum(), is_other.sum()])
+        return np.asarray(np.mean(counts, axis=0))
+
+    def is_chained(self, num_pairs: Features) -> bool:
+        """Tell whether what moves in another way does so in other pairs, too."""
+        first, second = self.pair.ids
+        num_chained = 0
+        for feature1, feature2 in self.other.tolist():
+            known = num_pairs[first, feature1], num_pairs[second, feature2]
+            num_chained += max(known) > 1
+        return num_chained >= MIN_CHAINED * len(self.other)
+
+
+def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
+    """Return the share of what moves as a model says, where something moves in another way, too.
+
+    Args:
+        model: The model.
+        graph: Its pairs, with their raw matches.
+
+    Returns:
+        Of the cells of the pairs that show another motion; 1 where too few of the pairs do.
+    """
+    poses = poses_of(model)
+    pairs = _strongest(graph.pairs_inside(poses))
+    cameras = cameras_of(model)
+    found = list[_Motions]()
+    for pair in pairs:
+        motions = _motions_of_pair(pair, poses, cameras, graph)
+        if motions:
+            found.append(motions)
+    num_pairs = _num_pairs_of_features(found)
+    showing = list[_Motions]()
+    for motions in found:
+        if motions.cells()[1] >= MIN_CELLS and motions.is_chained(num_pairs):
+            showing.append(motions)
+    if len(showing) < max(MIN_NUM_SHOWING, MIN_SHOWING * len(pairs)):
+        return 1.0
+    num_cells = np.sum([motions.cells() for motions in showing], axis=0)
+    return float(num_cells[0] / max(num_cells.sum(), 1.0))
+
+
+def _num_pairs_of_features(found: Collection[_Motions]) -> Features:
+    """Return in how many pairs each feature moves in another way than its model says."""
+    num_pairs: Features = Counter()
+    for motions in found:
+        for image_id, features in zip(motions.pair.ids, motions.other.T, strict=True):
+            num_pairs.update((image_id, feature) for feature in features.tolist())
+    return num_pairs
+
+
+def _strongest(pairs: Collection[VerifiedPair]) -> list[VerifiedPair]:
+    """Return the pairs that are among the strongest of one of their images."""
+    counts: Counter[int] = Counter()
+    found = list[VerifiedPair]()
+    for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
+        if min(counts[image_id] for image_id in pair.ids) < NUM_PAIRS:
+            found.append(pair)
+        counts.update(pair.ids)
+    return found[:MAX_NUM_PAIRS]
+
+
+def _motions_of_pair(
+    pair: VerifiedPair,
+    poses: PoseById,
+    cameras: CameraById,
+    graph: PairGraph,
+) -> _Motions | None:
+    """Return what moves as poses say, and what as one in another way; None where nothing does.
+
+    Args:
+        pair: The pair.
+        poses: cam_from_world of its images, by image id.
+        cameras: Of its images, by image id.
+        graph: Has keypoints and raw matches.
+    """
+    first, second = pair.ids
+    raw = graph.raw_matches.get(pair.ids, pair.matches)
+    matches = np.unique(np.concatenate([raw, pair.matches]), axis=0)
+    keypoints1 = graph.shaped_keypoints.get(first, graph.keypoints[first])
+    keypoints2 = graph.shaped_keypoints.get(second, graph.keypoints[second])
+    sides = Side(cameras[first], keypoints1), Side(cameras[second], keypoints2)
+    points1 = keypoints1[matches[:, 0], :2].astype(np.float64)
+    points2 = keypoints2[matches[:, 1], :2].astype(np.float64)
+    pose = relative_pose(poses[first], poses[second])
+    both = cameras[first], cameras[second]
+    agreement = compared_with_pose(pose, both, (points1, points2))
+    agrees = agreement.agrees
+    is_far = ~(agreement.errors_px <= FARTHER * agreement.tolerance_px)
+    options = VerificationOptions()
+    if is_far.sum() < options.min_num_inliers:
+        return None
+    geometry = estimate_geometry(sides, matches[is_far], options)
+    other = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+    return _Motions(pair, sides, matches[agrees], other) if len(other) else None
+
+
+def _in_cells(side: Side, features: Indices) -> Array:
+    """Return how many of some features of an image are in each cell of a grid."""
+    size = np.array([side.camera.width, side.camera.height])
+    cells = (side.keypoints[features, :2] / size * GRID).astype(int)
+    numbers = np.clip(cells, 0, GRID - 1) @ [1, GRID]
+    return np.bincount(numbers, minlength=GRID * GRID).astype(np.float64)
