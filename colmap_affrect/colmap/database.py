@@ -288,7 +288,8 @@ def write_keypoints(
 
 DESCRIPTOR_SIZE = 128  # COLMAP's SIFT
 DESCRIPTOR_NORM = 512  # COLMAP's SIFT
-# Added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0; judged
+# Added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0. Three
+# deviations and more of the components of a row of 128 and of unit length; theory
 SIGNED_SHIFT = 0.30
 
 

@@ -226,13 +226,8 @@ class FeatureStore(GroupStore):
         with self._open("r") as file:
             return self._features(self._group(file, name))
 
-    def lines(self, name: str) -> Lines | None:
-        """Return the straight lines of one image; None in the files of older versions."""
-        with self._open("r") as file:
-            return lines_from_datasets(_line_datasets(self._group(file, name)))
-
     def lines_of(self, names: Iterable[str]) -> dict[str, Lines]:
-        """Return the straight lines of images, without those that have none, in one opening."""
+        """Return the straight lines of images; files of older versions have none."""
         found = dict[str, Lines]()
         if not self.path.exists():
             return found

@@ -51,7 +51,7 @@ def test_lines_come_back_as_written_and_stay_when_features_are_added(
     store.write("a.png", some_features(3), SIZE, lines=lines)
     store.write("b.png", some_features(2), SIZE, lines=few())
     store.extend("a.png", some_features(4), 1)
-    read = store.lines("a.png")
+    read = store.lines_of(["a.png"]).get("a.png")
     assert read is not None
     assert read.likelihood is not None
     assert lines.likelihood is not None
@@ -62,7 +62,7 @@ def test_lines_come_back_as_written_and_stay_when_features_are_added(
     )
     assert_allclose(read.likelihood.rotations, lines.likelihood.rotations, rtol=1e-6)
     assert len(store.read("a.png")) == 7
-    without = store.lines("b.png")
+    without = store.lines_of(["b.png"]).get("b.png")
     assert without is not None
     assert without.likelihood is None
     assert len(without.segments) == 6
@@ -80,8 +80,8 @@ def test_stores_of_before_and_of_another_grid_have_no_lines(tmp_path: Path) -> N
     store.write(
         "other.png", some_features(3), SIZE, lines=Lines(lines.segments, coarse)
     )
-    assert store.lines("old.png") is None
-    assert store.lines("other.png") is None
+    assert not store.lines_of(["old.png"])
+    assert not store.lines_of(["other.png"])
     with h5py.File(store.path) as file:
         assert not LINE_DATASETS & set(file["old.png"])
 

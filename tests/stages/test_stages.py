@@ -118,7 +118,7 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
     assert workspace.record().keys() == {"recipe", *stages, "made_from", "mapped"}
     assert workspace.started_stages == stages
-    lines = FeatureStore(workspace.features).lines(names[0])
+    lines = FeatureStore(workspace.features).lines_of([names[0]]).get(names[0])
     assert lines is not None
     assert report.lines.keys() == set(names)
     assert report.lines[names[0]].num_segments == len(lines.segments)
@@ -135,7 +135,7 @@ def test_lines_are_asked_for_cameras_that_nobody_knows_alone(copy: Workspace) ->
     write_camera_records(copy.cameras, unknown)
     store = FeatureStore(copy.features)
     for name in NAMES:
-        lines = store.lines(name)
+        lines = store.lines_of([name]).get(name)
         said = lines.camera() if lines else None
         found = line_cameras(context).get(name)
         assert (found and found.focal) == (said and said.focal)
