@@ -31,9 +31,8 @@ follow the last photograph; measured on the same sets."""
 LIKELY_SHARE = 0.5  # of the time that all steps may take at most: most help; measured
 # Of a run: before, it has loaded files and networks, and says too little; display
 MIN_ELAPSED_S = 3.0
-MIN_NUM_MEASURED = (
-    2  # units after the first ones that tell how fast a stage is; display
-)
+# Units after the first ones that tell how fast a stage is; display
+MIN_NUM_MEASURED = 2
 LONGEST_IN_SECONDS = 90.0  # that a forecast tells in seconds; display
 
 

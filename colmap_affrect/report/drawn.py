@@ -16,6 +16,7 @@ import numpy as np
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.errors import OptionError
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
+from colmap_affrect.project.outputs import refuse_link
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 
@@ -78,7 +79,7 @@ class Drawn:
         Returns:
             What is said by hand, with the files that were written.
         """
-        folder = workspace.path / FOLDER
+        folder = folder_by_hand(workspace)
         tie_points = folder / "tie-points.csv"
         masks = folder / "masks"
         masks.mkdir(parents=True, exist_ok=True)
@@ -106,6 +107,14 @@ class Drawn:
 
 FOLDER = "by-hand"
 """Below the output folder: what was drawn on its page."""
+
+
+def folder_by_hand(workspace: Workspace) -> Path:
+    """Return where what was drawn is kept; OptionError where a link leads elsewhere."""
+    folder = workspace.path / FOLDER
+    for path in (folder, folder / "masks", folder / "before"):
+        refuse_link(path)
+    return folder
 
 
 def _mark(row: Any, names: Collection[str]) -> Mark:

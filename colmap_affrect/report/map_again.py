@@ -16,7 +16,7 @@ from colmap_affrect.progress import Progress
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.drawn import FOLDER, Drawn
+from colmap_affrect.report.drawn import Drawn, folder_by_hand
 from colmap_affrect.report.photographs import quality_of
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.report.verdict import QUALITIES
@@ -126,7 +126,7 @@ class MapsAgain:
 
     def _keep_models(self) -> None:
         """Keep the models that there are, for :mod:`colmap_affrect.report.two_runs`."""
-        kept = self.workspace.path / FOLDER / "before"
+        kept = folder_by_hand(self.workspace) / "before"
         if kept.is_dir():
             remove_own([kept])
         if self.workspace.sparse.is_dir():

@@ -366,7 +366,8 @@ def rows_of(
 
 def misplace(model: pycolmap.Reconstruction, rng: np.random.Generator) -> str:
     """Move a photograph around what it sees, by 20 to 90 degrees; return its name."""
-    image = model.images[int(rng.choice(sorted(model.reg_image_ids())))]
+    seeing = [i for i in sorted(model.reg_image_ids()) if model.images[i].num_points3D]
+    image = model.images[int(rng.choice(seeing))]
     seen = [model.point3D(p.point3D_id).xyz for p in image.get_observation_points2D()]
     middle = np.median(seen, axis=0)
     axis = rng.normal(size=3)

@@ -162,12 +162,13 @@ CHANGING = {
 
 BY_THE_DOOR = {
     "align.py", "pycolmap_api.py", "export.py", "hdf5.py",
-    "conversion.py", "line_pictures.py", "method_run.py",
+    "conversion.py", "line_pictures.py", "method_run.py", "printed_report.py",
 }  # fmt: skip
 """Write where the door lets them."""
 
 IN_WORK_FOLDERS = {
     "worker.py", "method_run.py", "evaluate.py", "__init__.py", "run_results.py",
+    "drawn.py", "map_again.py",
 }  # fmt: skip
 """Write where the door has refused folders of others, and links."""
 

@@ -273,3 +273,16 @@ def test_photographs_that_change_are_told_with_what_they_were() -> None:
         ["points", "1,200", "1,000"],
         ["reprojection error, px", "0.50", "0.25"],
     ]
+
+
+def test_what_is_drawn_is_not_written_where_a_link_leads(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "masks").mkdir(parents=True)
+    photograph = elsewhere / "masks" / "mine.png"
+    photograph.write_bytes(white_mask())
+    (workspace.path / "by-hand").symlink_to(elsewhere)
+    with pytest.raises(OptionError, match="symbolic link"):
+        Drawn([], {}).keep(workspace, ByHand())
+    assert photograph.exists()
