@@ -212,17 +212,29 @@ def _without_vain_trials(
     is_looked_at = options.min_num_inliers <= num_matches <= MAX_NUM_LOOKED_AT
     if not (is_looked_at and options.min_significance):
         return options
-    first = telling_shapes(keypoints[0])
-    second = telling_shapes(keypoints[1])
-    if first is None or second is None:
-        return options
-    frames1 = np.concatenate([first, _positions(keypoints[0])[:, :, None]], axis=2)
-    frames2 = np.concatenate([second, _positions(keypoints[1])[:, :, None]], axis=2)
-    num_consistent = num_consistent_matches(frames1, frames2)
-    if num_consistent >= MIN_CONSISTENT:
+    num_consistent = num_consistent_keypoints(keypoints)
+    if num_consistent is None or num_consistent >= MIN_CONSISTENT:
         return options
     most = NUM_TRIALS_IN_VAIN if num_consistent else NUM_TRIALS_OF_NOTHING
     return options.changed(max_num_trials=min(options.max_num_trials, most))
+
+
+def num_consistent_keypoints(keypoints: Keypoints) -> int | None:
+    """Return how many matches agree with matches beside them.
+
+    Args:
+        keypoints: of both images, (N, 2, 4 or 6), of which those of a row match.
+
+    Returns:
+        Their number; None where the keypoints have no shapes that tell it.
+    """
+    first = telling_shapes(keypoints[0])
+    second = telling_shapes(keypoints[1])
+    if first is None or second is None:
+        return None
+    frames1 = np.concatenate([first, _positions(keypoints[0])[:, :, None]], axis=2)
+    frames2 = np.concatenate([second, _positions(keypoints[1])[:, :, None]], axis=2)
+    return num_consistent_matches(frames1, frames2)
 
 
 def _positions(keypoints: Floats) -> Array:

@@ -18,6 +18,7 @@ from colmap_affrect.colmap.verification import (
     Side,
     VerificationOptions,
     estimate_geometry,
+    num_consistent_keypoints,
 )
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.mappers.model_score import GRID
@@ -162,7 +163,13 @@ def _motions_of_pair(
     options = VerificationOptions()
     if is_far.sum() < options.min_num_inliers:
         return None
-    geometry = estimate_geometry(sides, matches[is_far], options)
+    far = matches[is_far]
+    num_consistent = num_consistent_keypoints(
+        (keypoints1[far[:, 0]], keypoints2[far[:, 1]])
+    )
+    if num_consistent is not None and num_consistent < options.min_num_inliers:
+        return None  # the matches of a surface agree with those beside them
+    geometry = estimate_geometry(sides, far, options)
     other = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
     return _Motions(pair, sides, matches[agrees], other) if len(other) else None
 
