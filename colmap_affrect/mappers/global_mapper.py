@@ -1,5 +1,6 @@
 """COLMAP's global mapper: all rotations first, then all positions, then one adjustment."""
 
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -27,6 +28,8 @@ SEEDED_SECTIONS = (
     "mapper.global_positioning.",
     "mapper.retriangulation.",
 )
+ONE_AT_A_TIME = threading.Lock()
+"""COLMAP's global mapper opens a database so that another one cannot open the same meanwhile."""
 THREADED_SECTIONS = ("", "mapper.", "mapper.bundle_adjustment.ceres.solver_options.")
 
 
@@ -87,9 +90,10 @@ class GlobalMapper:
         native = self.native(task, random_seed)
 
         def call(_: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
-            found = pycolmap.global_mapping(
-                task.database_path, task.colors_path, output_path, options=native
-            )
+            with ONE_AT_A_TIME:
+                found = pycolmap.global_mapping(
+                    task.database_path, task.colors_path, output_path, options=native
+                )
             return list(found.values())
 
         models = run_mapping(call, task.cancellation, "global mapper")

@@ -92,9 +92,10 @@ def test_any_name_of_a_file_comes_through_or_is_left_out_with_a_line(
     assert ended.code in (0, 3)
     warnings = "\n".join(ended.stderr)
     assert (
-        "names: 3 left out, such as \\u001b[31mred.png: the name has a line break"
+        "names: 2 left out, such as \\u001b[31mred.png: the name has a line break"
         in warnings
     )
+    assert "1 left out, such as \\udcff.png" in warnings
     assert "*.heic: 1 left out, such as \\udcfe.heic" in warnings
     log = (out / "run.log").read_text(encoding="utf-8")
     shown = ended.stdout + warnings + log
