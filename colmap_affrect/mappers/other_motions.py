@@ -139,7 +139,7 @@ def _motions_of_pair(
     cameras: CameraById,
     graph: PairGraph,
 ) -> _Motions | None:
-    """Return what moves as poses say, and what as one in another way; None where nothing does.
+    """Return what moves as poses say, and what as one in another way; None where that is little.
 
     Args:
         pair: The pair.
@@ -164,6 +164,9 @@ def _motions_of_pair(
     if is_far.sum() < options.min_num_inliers:
         return None
     far = matches[is_far]
+    at_most = _Motions(pair, sides, matches[agrees], far)
+    if at_most.cells()[1] < MIN_CELLS:
+        return None
     num_consistent = num_consistent_keypoints(
         (keypoints1[far[:, 0]], keypoints2[far[:, 1]])
     )
