@@ -346,7 +346,8 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
 def inspect(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
     if not options.image.is_file():
-        raise OptionError(f"{options.image}: no such file; give a photograph")
+        why = "is a folder" if options.image.is_dir() else "no such file"
+        raise OptionError(f"{options.image}: {why}; give a photograph")
     photographs = Photographs(
         options.image.parent, given.over(MaskOptions(), options, "masks")
     )
