@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Poses
 from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.mappers.pair_graph import PairGraph
 
 WIDTH = 1000
 HEIGHT = 700
@@ -43,6 +44,24 @@ def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
     return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
 
 
+def wall_camera(matrix: NDArray[np.float64] = MATRIX) -> pycolmap.Camera:
+    """Return the camera that all images share."""
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT)
+    camera.params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    return camera
+
+
+def posed_model(path: Path, poses: Poses) -> pycolmap.Reconstruction:
+    """Return a model of the images of a database, without points."""
+    model = pycolmap.Reconstruction()
+    model.load(PairGraph.read(path).cache)
+    for image_id, name in enumerate(poses, 1):
+        frame = model.images[image_id].frame
+        frame.set_cam_from_world(1, pycolmap.Rigid3d(np.column_stack(poses[name])))
+        model.register_frame(frame.frame_id)
+    return model
+
+
 def write_scene(
     path: Path,
     poses: Poses,
@@ -66,11 +85,7 @@ def write_scene(
         rows = np.arange(inside.sum())
         matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
     with closing(pycolmap.Database.open(path)) as database:
-        camera = pycolmap.Camera(
-            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
-        )
-        camera.params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        write_images(database, camera, names)
+        write_images(database, wall_camera(matrix), names)
         for i, parts in keypoints.items():
             database.write_keypoints(i + 1, np.concatenate(parts).astype(np.float32))
         for (first, second), indices in matches.items():

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.data import Mask
-from colmap_affrect.geometry.arrays import Array, Bools, Indices
+from colmap_affrect.data import Mask, in_mask
+from colmap_affrect.geometry.arrays import Bools, Indices
+from colmap_affrect.geometry.conventions import pixel_from_colmap
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.images.reading import read_mask
 
@@ -55,7 +56,7 @@ def leave_out_masked(
     for image_id, mask in masks.items():
         if database.exists_keypoints(image_id):
             positions = np.asarray(database.read_keypoints(image_id), float)[:, :2]
-            is_free[image_id] = is_inside(mask, positions)
+            is_free[image_id] = in_mask(mask, pixel_from_colmap(positions))
     changed = []
     for pair in combinations(image_ids, 2):
         if is_free.keys() & set(pair):
@@ -65,21 +66,6 @@ def leave_out_masked(
                 _replace_matches(database, pair, kept)
                 changed.append(pair)
     return changed
-
-
-def is_inside(mask: Mask, positions: Array) -> Bools:
-    """Return which positions a mask lets through.
-
-    Args:
-        mask: (H, W), False where nothing counts.
-        positions: (N, 2) px from the upper left corner of the image.
-
-    Returns:
-        (N,) True where the mask is.
-    """
-    last = np.array(mask.shape[::-1]) - 1
-    pixels = np.clip(np.floor(positions), 0, last).astype(int)
-    return np.asarray(mask[pixels[:, 1], pixels[:, 0]], bool)
 
 
 def _known_matches(database: pycolmap.Database, pair: tuple[int, int]) -> Indices:

@@ -150,7 +150,8 @@ class SparseMapper(IncrementalMapper):
         best = self._tested(task, graph, native, show, by_colmap)
 
         def map_again(some: PairGraph) -> list[MappedModel]:
-            return self._tested(task, some, native, show, list)
+            # COLMAP's own mapper, which would take all pairs, makes none.
+            return self._tested(task, some, native, show, by_colmap=list)
 
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_again)
@@ -435,10 +436,10 @@ class _HypothesisTest:
         model = _with_per_image_cameras(
             self.per_image, graph, self.search, first.reconstruction
         )
-        if (
-            model is None
-            or self.per_image.scorer.score(model) <= self.score + MIN_SCORE_GAIN
-        ):
+        if model is None:
+            return
+        score = self.per_image.scorer.score(model)
+        if score <= self.score + MIN_SCORE_GAIN:
             return
         share = self._motion_share(first)
         changed = _also_by(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,27 +69,15 @@ class Incremental:
         self.right = MAPPERS.make(MAPPERS.options("incremental"))
         self.options = self.right.options
 
-    def map(
-        self,
-        task: MappingTask,
-        output_path: Path,
-        random_seed: int,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
-        return self.right.map(task, output_path, random_seed, show)
+    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
+        return self.right.map(task, *others)
 
 
 class MovesCameras(Incremental):
     """Changes cameras that are given."""
 
-    def map(
-        self,
-        task: MappingTask,
-        output_path: Path,
-        random_seed: int,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
-        models = super().map(task, output_path, random_seed, show)
+    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
+        models = super().map(task, *others)
         for camera in models[0].reconstruction.cameras.values():
             camera.params = [*camera.params[:-1], camera.params[-1] + 0.01]
         return models
@@ -98,43 +86,25 @@ class MovesCameras(Incremental):
 class NeverStops(Incremental):
     """Does not look at the token."""
 
-    def map(
-        self,
-        task: MappingTask,
-        output_path: Path,
-        random_seed: int,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
+    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
         task = replace(task, cancellation=None)
-        return super().map(task, output_path, random_seed, show)
+        return super().map(task, *others)
 
 
 class FailsAsItLikes(Incremental):
     """Does not expect that there may be no model."""
 
-    def map(
-        self,
-        task: MappingTask,
-        output_path: Path,
-        random_seed: int,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
-        models = super().map(task, output_path, random_seed, show)
+    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
+        models = super().map(task, *others)
         return [models[0]]
 
 
 class HandlesSignals(Incremental):
     """Works in the main thread alone."""
 
-    def map(
-        self,
-        task: MappingTask,
-        output_path: Path,
-        random_seed: int,
-        show: Callable[[int], None],
-    ) -> list[MappedModel]:
+    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        return super().map(task, output_path, random_seed, show)
+        return super().map(task, *others)
 
 
 class OneMapper(MapperContract):

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from mapping_tasks import mapper_of, task_with_given_cameras, write_images
 from numpy.typing import NDArray
-from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
+from wall_scene import (
+    is_inside,
+    posed_model,
+    project,
+    views,
+    wall,
+    wall_camera,
+)
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -54,11 +61,7 @@ def scene(
         now[moves, 1] += SHIFT * image_id
         pixels[image_id] = project(now, poses[name])
     with open_database(path) as database:
-        camera = pycolmap.Camera(
-            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
-        )
-        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
-        write_images(database, camera, poses)
+        write_images(database, wall_camera(), poses)
         for image_id, of_image in pixels.items():
             database.write_keypoints(image_id, of_image.astype(np.float32))
         for number, (first, second) in enumerate(combinations(pixels, 2)):
@@ -73,12 +76,7 @@ def scene(
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometry.inlier_matches = np.stack([stays, stays], 1).astype(np.uint32)
             database.write_two_view_geometry(first, second, geometry)
-    model = pycolmap.Reconstruction()
-    model.load(PairGraph.read(path).cache)
-    for image_id, name in enumerate(poses, 1):
-        frame = model.images[image_id].frame
-        frame.set_cam_from_world(1, pycolmap.Rigid3d(np.column_stack(poses[name])))
-        model.register_frame(frame.frame_id)
+    model = posed_model(path, poses)
     for point in np.flatnonzero(~moves):
         track = pycolmap.Track()
         for image_id, of_image in pixels.items():

@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 from mapping_tasks import mapper_of, task_with_given_cameras, write_images
 from numpy.typing import NDArray
-from wall_scene import HEIGHT, MATRIX, WIDTH, is_inside, project, views, wall
+from wall_scene import (
+    WIDTH,
+    is_inside,
+    posed_model,
+    project,
+    views,
+    wall,
+    wall_camera,
+)
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -69,11 +77,7 @@ def scene(path: Path, is_shared: IsShared, collage: int = 0) -> pycolmap.Reconst
         keypoints[image_id] = pixels[seen]
         rows[image_id] = {int(point): row for row, point in enumerate(seen)}
     with open_database(path) as database:
-        camera = pycolmap.Camera(
-            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT
-        )
-        camera.params = MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
-        write_images(database, camera, poses)
+        write_images(database, wall_camera(), poses)
         for image_id, pixels in keypoints.items():
             database.write_keypoints(image_id, pixels.astype(np.float32))
         for first, second in combinations(rows, 2):
@@ -85,12 +89,7 @@ def scene(path: Path, is_shared: IsShared, collage: int = 0) -> pycolmap.Reconst
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometry.inlier_matches = np.array(matches, np.uint32)
             database.write_two_view_geometry(first, second, geometry)
-    model = pycolmap.Reconstruction()
-    model.load(PairGraph.read(path).cache)
-    for image_id, name in enumerate(poses, 1):
-        frame = model.images[image_id].frame
-        frame.set_cam_from_world(1, pycolmap.Rigid3d(np.column_stack(poses[name])))
-        model.register_frame(frame.frame_id)
+    model = posed_model(path, poses)
     for point, position in enumerate(points):
         seen_by = [image_id for image_id in rows if point in rows[image_id]]
         if len(seen_by) > 1:
