@@ -7,14 +7,12 @@ moves is the same surface again and again.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import relative_pose
 from colmap_affrect.colmap.verification import (
     Side,
@@ -22,11 +20,10 @@ from colmap_affrect.colmap.verification import (
     estimate_geometry,
     num_consistent_keypoints,
 )
-from colmap_affrect.geometry.arrays import Array, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.mappers.model_score import GRID
 from colmap_affrect.mappers.pair_graph import (
     CameraById,
-    Ids,
     PairGraph,
     PoseById,
     VerifiedPair,
@@ -87,42 +84,12 @@ class _Motions:
         return num_chained >= MIN_CHAINED * len(self.other)
 
 
-@dataclass(frozen=True)
-class _RawFeatures:
-    """What the database has of some pairs, not of all: it takes much memory."""
-
-    matches: Mapping[Ids, Indices]  # (M, 2) raw ones and inliers, each once
-    keypoints: Mapping[int, Singles]  # (N, 2, 4 or 6) by image id
-
-    @classmethod
-    def read(cls, pairs: Sequence[VerifiedPair], graph: PairGraph) -> Self:
-        """Read them; of a graph that no file is known of there are the inliers alone.
-
-        Args:
-            pairs: Of the graph.
-            graph: It names the database.
-        """
-        matches = {pair.ids: pair.matches for pair in pairs}
-        keypoints = dict(graph.keypoints)
-        if graph.path is None:
-            return cls(matches, keypoints)
-        with open_database(graph.path) as database:
-            for ids, inliers in matches.items():
-                rows = np.asarray(database.read_matches(*ids), np.int64)
-                both = np.concatenate([rows.reshape(-1, 2), inliers])
-                matches[ids] = np.unique(both, axis=0)
-            for image_id in {image_id for ids in matches for image_id in ids}:
-                shaped = database.read_keypoints(image_id)
-                keypoints[image_id] = np.asarray(shaped, np.float32)
-        return cls(matches, keypoints)
-
-
 def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
     """Return the share of what moves as a model says, where something moves in another way, too.
 
     Args:
         model: The model.
-        graph: Its pairs; raw matches are those of its database.
+        graph: Its pairs, with their raw matches.
 
     Returns:
         Of the cells of the pairs that show another motion; 1 where too few of the pairs do.
@@ -130,10 +97,9 @@ def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
     poses = poses_of(model)
     pairs = _strongest(graph.pairs_inside(poses))
     cameras = cameras_of(model)
-    raw = _RawFeatures.read(pairs, graph)
     found = list[_Motions]()
     for pair in pairs:
-        motions = _motions_of_pair(pair, poses, cameras, raw)
+        motions = _motions_of_pair(pair, poses, cameras, graph)
         if motions:
             found.append(motions)
     num_pairs = _num_pairs_of_features(found)
@@ -171,7 +137,7 @@ def _motions_of_pair(
     pair: VerifiedPair,
     poses: PoseById,
     cameras: CameraById,
-    raw: _RawFeatures,
+    graph: PairGraph,
 ) -> _Motions | None:
     """Return what moves as poses say, and what as one in another way; None where that is little.
 
@@ -179,12 +145,13 @@ def _motions_of_pair(
         pair: The pair.
         poses: cam_from_world of its images, by image id.
         cameras: Of its images, by image id.
-        raw: Of the pair, and perhaps others.
+        graph: Has keypoints and raw matches.
     """
     first, second = pair.ids
-    matches = raw.matches[pair.ids]
-    keypoints1 = raw.keypoints[first]
-    keypoints2 = raw.keypoints[second]
+    raw = graph.raw_matches.get(pair.ids, pair.matches)
+    matches = np.unique(np.concatenate([raw, pair.matches]), axis=0)
+    keypoints1 = graph.shaped_keypoints.get(first, graph.keypoints[first])
+    keypoints2 = graph.shaped_keypoints.get(second, graph.keypoints[second])
     sides = Side(cameras[first], keypoints1), Side(cameras[second], keypoints2)
     points1 = keypoints1[matches[:, 0], :2].astype(np.float64)
     points2 = keypoints2[matches[:, 1], :2].astype(np.float64)

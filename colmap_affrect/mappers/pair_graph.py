@@ -117,7 +117,10 @@ class PairGraph:
     pairs: Pairs  # sorted by ids
     weak: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
-    path: Path | None = None  # of the database, where it was read from a file
+    raw_matches: dict[Ids, Indices] = field(default_factory=dict)
+    """Raw (M, 2) matches of the strongest pairs, where a database was read."""
+    shaped_keypoints: dict[int, Singles] = field(default_factory=dict)
+    """(N, 2, 4 or 6) by image id, of the same pairs, as the database has them."""
     _agreements: dict[Ids, _KnownAgreement] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -133,8 +136,14 @@ class PairGraph:
                 the same (:mod:`colmap_affrect.mappers.few_matches`).
         """
         with open_database(path) as database:
-            graph = replace(cls.of(database, min_num_matches), path=path)
+            graph = cls.of(database, min_num_matches)
+            for pair in graph.pairs:
+                raw = np.asarray(database.read_matches(*pair.ids), np.int64)
+                graph.raw_matches[pair.ids] = raw.reshape(-1, 2)
             enough = {pair.ids: pair.matches for pair in graph.verified}
+            for image_id in graph.keypoints:
+                rows = database.read_keypoints(image_id)
+                graph.shaped_keypoints[image_id] = np.asarray(rows, np.float32)
             few = sure_few_matches(database, enough)
             return graph._with_few_matches(few, database) if few else graph
 
