@@ -13,6 +13,9 @@ Result = TypeVar("Result")
 POLL_S = 0.2  # resource: how long it takes at most to notice
 # That a call has to end after it was cancelled; some never look; resource
 LEAVE_AFTER_S = 3.0
+# COLMAP's mappers open a database by its path and do not wait for one another: of two threads
+# that map the same at once, one would fail.
+ONE_MAPPING = threading.Lock()
 
 
 def run_cancellable(

@@ -4,6 +4,7 @@ Everything is checked before it is written: an index out of range would later en
 """
 
 import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -27,6 +28,9 @@ logger = logging.getLogger(__name__)
 BYTES_PER_ROW = 4096  # format: a page of SQLite
 # What :func:`require_database_space` reckons with; measured
 BYTES_OF_EMPTY_DATABASE = 1 << 19
+# How often a database is tried that others are using; resource
+TRIES_TO_OPEN = 10
+PAUSE_S = 0.1  # resource: before it is tried again
 
 
 @contextmanager
@@ -34,8 +38,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
     """Open a database and close it again; pycolmap's failures become errors of one line."""
     try:
         require_regular(path)
-        # A Ctrl-C while pycolmap converts a Path would become a TypeError.
-        database = pycolmap.Database.open(str(path))
+        database = _open_when_free(path)
     except NotAFileError as error:
         raise DatabaseError(
             f"{path}: not a usable COLMAP database ({error})"
@@ -53,6 +56,22 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         if fault:
             raise DatabaseError(f"{path}: {fault}; {_mend(path)}") from error
         raise cannot_write(path, error) from error
+
+
+def _open_when_free(path: Path) -> pycolmap.Database:
+    """Open a database; one that another program just opens or closes is tried again soon.
+
+    COLMAP locks a database for a moment when it opens and closes it, and does not wait for others.
+    """
+    for _ in range(TRIES_TO_OPEN - 1):
+        try:
+            # A Ctrl-C while pycolmap converts a Path would become a TypeError.
+            return pycolmap.Database.open(str(path))
+        except RuntimeError:
+            if damage_of(path):
+                break
+            time.sleep(PAUSE_S)
+    return pycolmap.Database.open(str(path))
 
 
 def _mend(path: Path) -> str:

@@ -1,12 +1,11 @@
 """COLMAP's global mapper: all rotations first, then all positions, then one adjustment."""
 
-import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_mapping
+from colmap_affrect.colmap.cancellable import ONE_MAPPING, run_mapping
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.native_options import Plain, resolve, set_values
 from colmap_affrect.errors import OptionError
@@ -28,8 +27,6 @@ SEEDED_SECTIONS = (
     "mapper.global_positioning.",
     "mapper.retriangulation.",
 )
-ONE_AT_A_TIME = threading.Lock()
-"""COLMAP's global mapper opens a database so that another one cannot open the same meanwhile."""
 THREADED_SECTIONS = ("", "mapper.", "mapper.bundle_adjustment.ceres.solver_options.")
 
 
@@ -87,13 +84,22 @@ class GlobalMapper:
         """
         if task.extend:
             raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
+        with ONE_MAPPING:
+            return self._models(task, output_path, random_seed, show)
+
+    def _models(
+        self,
+        task: MappingTask,
+        output_path: Path,
+        random_seed: int,
+        show: Callable[[int], None],
+    ) -> list[MappedModel]:
         native = self.native(task, random_seed)
 
         def call(_: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
-            with ONE_AT_A_TIME:
-                found = pycolmap.global_mapping(
-                    task.database_path, task.colors_path, output_path, options=native
-                )
+            found = pycolmap.global_mapping(
+                task.database_path, task.colors_path, output_path, options=native
+            )
             return list(found.values())
 
         models = run_mapping(call, task.cancellation, "global mapper")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_mapping
+from colmap_affrect.colmap.cancellable import ONE_MAPPING, run_mapping
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import model_poses, registered_names
 from colmap_affrect.colmap.native_options import resolve, set_values
@@ -91,17 +91,18 @@ class IncrementalMapper:
             AffrectError: When COLMAP ends with an error.
             KeyboardInterrupt: After mapping has been stopped.
         """
-        native = self.native(task, random_seed)
-        if task.image_path is None:
-            native.extract_colors = False
-        run = _PipelineRun(
-            task=task,
-            options=native,
-            output_path=output_path,
-            show=show,
-            database_path=task.database_path,
-        )
-        models = run_mapping(run.models, task.cancellation, "incremental mapper")
+        with ONE_MAPPING:
+            native = self.native(task, random_seed)
+            if task.image_path is None:
+                native.extract_colors = False
+            run = _PipelineRun(
+                task=task,
+                options=native,
+                output_path=output_path,
+                show=show,
+                database_path=task.database_path,
+            )
+            models = run_mapping(run.models, task.cancellation, "incremental mapper")
         return [MappedModel(model) for model in models]
 
     def native(

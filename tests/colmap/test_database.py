@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -231,3 +233,23 @@ def test_what_is_no_database_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "any.db").mkdir()
     with pytest.raises(DatabaseError, match="not a usable COLMAP database"):
         image_ids(tmp_path / "any.db")
+
+
+LOCK = """
+import sqlite3, sys, time
+other = sqlite3.connect(sys.argv[1], isolation_level=None)
+other.execute("PRAGMA locking_mode=EXCLUSIVE")
+other.execute("BEGIN EXCLUSIVE")
+print("locked", flush=True)
+time.sleep(0.3)
+"""
+
+
+def test_database_that_another_program_locks_for_a_moment_is_opened_after_it(
+    matchable_path: Path,
+) -> None:
+    command = [sys.executable, "-c", LOCK, matchable_path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"locked\n"
+        with open_database(matchable_path) as database:
+            assert database.num_images() == 4
