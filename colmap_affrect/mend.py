@@ -21,7 +21,7 @@ from colmap_affrect.colmap.checks import (
 )
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.tables import damage_of, rows_digest
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, with_flags
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
@@ -131,8 +131,7 @@ def _why_lost(workspace: Workspace) -> str:
         # A command was killed: is what it wrote good?
         refuse_unusable(path, FATAL_AS_IT_IS)
     except AffrectError as error:
-        reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
-        return CHANGED if sealed else f"cannot be used ({reason})"
+        return CHANGED if sealed else f"cannot be used ({with_flags(error.what)})"
     return ""
 
 

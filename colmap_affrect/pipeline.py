@@ -12,7 +12,7 @@ from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
 from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError, Option, OptionError
 from colmap_affrect.escalation.climb import climb
 from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.features.weights import resolve
@@ -167,7 +167,9 @@ def _check_by_hand(
     )  # refuses what names other photographs, or lies outside
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
-            f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
+            f"the {mapper.options.name} mapper takes none",
+            where=Option("tie-points"),
+            advice=("use ", Option("mapper"), " sparse"),
         )
     return marks
 
@@ -180,7 +182,9 @@ def _check_extension(
         return
     if not mapper.options.can_extend:
         raise OptionError(
-            f"--extend: the {mapper.options.name} mapper cannot; use --mapper sparse"
+            f"the {mapper.options.name} mapper cannot",
+            where=Option("extend"),
+            advice=("use ", Option("mapper"), " sparse"),
         )
     if overwrite:
         extend.refuse_discarding(output_path)
@@ -234,11 +238,15 @@ def _context(
     path = as_path(output_path, "output_path")
     if not (executor is None or callable(getattr(executor, "map", None))):
         raise OptionError(
-            f"executor={executor!r}: has no method 'map'; give an Executor"
+            "has no method 'map'",
+            where=f"executor={executor!r}",
+            advice="give an Executor",
         )
     if path.is_file():
         wanted = "give the output folder of a run; map_database and verify_matches take databases"
-        raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
+        raise OptionError(
+            "is a file", where=f"output_path={str(path)!r}", advice=wanted
+        )
     return Context(
         workspace=Workspace(path),
         resources=Resources.given(resources, "resources"),
@@ -474,7 +482,9 @@ def _check_foreign(
 ) -> None:
     """Refuse what cannot be mapped, or not so, before anything is made."""
     if foreign.match_type not in get_args(MatchType):
-        raise OptionError(f"match_type={foreign.match_type!r}: give 'raw' or 'inliers'")
+        raise OptionError(
+            "give 'raw' or 'inliers'", where=f"match_type={foreign.match_type!r}"
+        )
     schema_version(foreign.path)
     _check_extension(
         extend, mapper, output_path=context.workspace.path, overwrite=overwrite
@@ -548,6 +558,8 @@ def _names_and_gone(
     if gone and not may_be_gone:
         path = context.inputs.image_path
         raise ImageError(
-            f"{path}: {gone[0]} has features, and is gone; run extract again"
+            f"{gone[0]} has features, and is gone",
+            where=path,
+            advice="run extract again",
         )
     return sorted({*names, *gone}), gone

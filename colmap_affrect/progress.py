@@ -267,7 +267,9 @@ class Progress:
         if isinstance(progress, cls):
             return progress
         if not (progress is None or isinstance(progress, bool)):
-            raise OptionError(f"progress={progress!r}: give True, False or a Progress")
+            raise OptionError(
+                "give True, False or a Progress", where=f"progress={progress!r}"
+            )
         shown = cls(sys.stderr)
         is_wanted = shown.takes_bars if progress is None else progress
         return shown if is_wanted else SILENT

@@ -257,7 +257,8 @@ def match_image_pairs(
     path = translate.given_path(options.match_list_path)
     if not path:
         raise AffrectError(
-            "pairing_options: give match_list_path, a file with two names per line"
+            "give match_list_path, a file with two names per line",
+            where="pairing_options",
         )
     return read_pairs(Path(path), images.names)
 
@@ -281,11 +282,12 @@ def _match_descriptors(
     nearest = matching if isinstance(matching, NearestOptions) else None
     if matching and not nearest:
         raise OptionError(
-            "matching_options: descriptors of a database take NearestOptions alone"
+            "descriptors of a database take NearestOptions alone",
+            where="matching_options",
         )
     refused = sorted(asked.keys() & {"guided_matching", "rig_verification"})
     if refused:
-        raise OptionError(f"{refused[0]}: not for descriptors of another program")
+        raise OptionError("not for descriptors of another program", where=refused[0])
     path = context.workspace.database
     begun = time.perf_counter()
     refuse_unusable(path)

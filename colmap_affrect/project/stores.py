@@ -259,7 +259,9 @@ class FeatureStore(GroupStore):
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if not has_entry(file, name):
-            raise StoreError(f"{self.path}: no features of {name}; run extract first")
+            raise StoreError(
+                f"no features of {name}", where=self.path, advice="run extract first"
+            )
         return file[name]
 
     @staticmethod
@@ -514,7 +516,9 @@ class MatchStore(GroupStore):
                 key = pair_key(name1, name2)
                 if not has_entry(file, key):
                     raise StoreError(
-                        f"{self.path}: no matches of {name1}, {name2}; run match"
+                        f"no matches of {name1}, {name2}",
+                        where=self.path,
+                        advice="run match",
                     )
                 yield _read_matches(file[key], (name1, name2))
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.errors import AffrectError, one_line
+from colmap_affrect.errors import AffrectError, one_line, with_flags
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.outputs import remove_own
@@ -99,7 +99,7 @@ class MapsAgain:
         try:
             answer = self._map(drawn)
         except AffrectError as error:
-            answer = {"error": one_line(str(error))}
+            answer = {"error": one_line(with_flags(error.words))}
         except Exception as error:  # the page has to hear of it, whatever it is
             logger.exception("mapping has failed")
             answer = {"error": f"mapping has failed, run.log says why: {error!r:.300}"}

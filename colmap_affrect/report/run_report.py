@@ -68,7 +68,8 @@ class RunReport(ReconstructionReport):
             raise NoModelError(self.why_no_model)
         if number not in range(len(self.models)):
             raise OptionError(
-                f"number={number!r}: the models are 0 to {len(self.models) - 1}"
+                f"the models are 0 to {len(self.models) - 1}",
+                where=f"number={number!r}",
             )
         return pycolmap.Reconstruction(Workspace(self.output_path).sparse / str(number))
 

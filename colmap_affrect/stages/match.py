@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError, PartError, StoreError, such_as
+from colmap_affrect.errors import Option, OptionError, PartError, StoreError, such_as
 from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -109,8 +109,11 @@ def _record_options(
     try:
         context.extraction.matchers(options)
     except OptionError as error:
-        other = "other features than those here take 'run' with another --output-path"
-        raise OptionError(f"{error}; {other}") from error
+        other = (
+            "other features than those here take 'run' with another ",
+            Option("output-path"),
+        )
+        raise OptionError(error, advice=other) from error
     weights = load_matchers(context, context.extraction, options)
     record = options.to_mapping()
     if weights:
@@ -363,7 +366,7 @@ def _require_features(
     if lost:
         names_lost = such_as(sorted(lost))
         raise StoreError(
-            f"{store.path}: no features of {names_lost}; run extract first"
+            f"no features of {names_lost}", where=store.path, advice="run extract first"
         )
 
 

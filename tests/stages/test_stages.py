@@ -262,7 +262,7 @@ def test_advice_is_about_what_is_wrong(
     assert "show no depth" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
     monkeypatch.setattr(
-        Resources, "how_to_complete", lambda *_: "pip install it, or fetch it"
+        Resources, "commands_to_complete", lambda *_: ["pip install it", "fetch it"]
     )
     assert (
         advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
