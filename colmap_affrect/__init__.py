@@ -24,16 +24,9 @@ if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
 
 _NAMES_OF_MODULES = {
-    # Photographs to a model: everything, one stage after the other, or the database of others.
-    "pipeline": (
-        "choose_pairs",
-        "extract",
-        "map_database",
-        "map_images",
-        "match",
-        "run",
-        "verify",
-    ),
+    # Photographs to a model: everything, the database of others, or one stage after the other.
+    "pipeline": ("map_database", "run"),
+    "single_stages": ("choose_pairs", "extract", "map_images", "match", "verify"),
     # What a run is made of, and what it returns.
     "colmap.by_hand": ("ByHand",),
     "colmap.verification": ("VerificationOptions",),

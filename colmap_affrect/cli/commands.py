@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from colmap_affrect import doctor as examination
-from colmap_affrect import pipeline
+from colmap_affrect import pipeline, single_stages
 from colmap_affrect.cli import given
 from colmap_affrect.colmap import old_databases
 from colmap_affrect.colmap.by_hand import ByHand
@@ -375,7 +375,7 @@ def serve(options: argparse.Namespace) -> None:
         raise OptionError(f"give a number up to {MAX_PORT}", where=Option("port", port))
 
     def map_images(said: ByHand, progress: Progress) -> RunReport:
-        return pipeline.map_images(options.path, by_hand=said, progress=progress)
+        return single_stages.map_images(options.path, by_hand=said, progress=progress)
 
     page_server.serve(Workspace(options.path), by_hand, port, map_images, show)
 

@@ -20,8 +20,8 @@ from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.regular_files import NotAFileError, require_regular
-from colmap_affrect.project.stores import FeatureStore
 
 logger = logging.getLogger(__name__)
 

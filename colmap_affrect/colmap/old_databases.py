@@ -11,9 +11,9 @@ from colmap_affrect.colmap.database import fill_descriptors, open_database
 from colmap_affrect.colmap.database_copy import copy_database, read_names
 from colmap_affrect.errors import DatabaseError, Option, OptionError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.paths import PathLike, as_path
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 MAPPER_OPTIONS = (

@@ -28,10 +28,10 @@ from colmap_affrect.mappers.mapping import (
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.match_state import LearnedModels, Worth
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import MatchStore, PairMatches
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images

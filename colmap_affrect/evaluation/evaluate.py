@@ -43,10 +43,10 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.report import installed_versions
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Resources
 from colmap_affrect.stages.match import CachedMatcher, Matching

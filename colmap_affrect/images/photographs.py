@@ -26,6 +26,7 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.image_failures import ImageFailure, unusable
+from colmap_affrect.project.match_store import pair_key
 from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.regular_files import read_regular_text
@@ -36,7 +37,6 @@ from colmap_affrect.project.stage_warnings import (
     WarningCode,
     texts_by_subject,
 )
-from colmap_affrect.project.stores import pair_key
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 FOLDERS_OF_SYSTEMS: dict[str, WarningCode] = {

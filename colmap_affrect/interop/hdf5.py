@@ -75,15 +75,11 @@ from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import frame_datasets
 from colmap_affrect.project.given_h5 import GivenFile, open_given_file
+from colmap_affrect.project.match_store import PairMatches, hloc_matches, pair_key
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
-from colmap_affrect.project.stores import (
-    PairMatches,
-    frame_datasets,
-    hloc_matches,
-    pair_key,
-)
 from colmap_affrect.stages.descriptors import (
     Arrays,
     iterate_descriptor_matches,

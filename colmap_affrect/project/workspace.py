@@ -137,20 +137,24 @@ class Workspace:
                 advice=("give a new or an empty one as ", Option("output-path")),
             )
         with suppress(OSError):  # not there, or refused when it is to be used
-            foreign = []
-            for path in self.path.iterdir():
-                stem = path.name.partition(".")[0]
-                if stem in OWN_STEMS or path.name == outputs.LOCK:
-                    outputs.refuse_link(path)
-                    outputs.refuse_what_waits(path)
-                if not _may_be_ours(path):
-                    foreign.append(path.name)
-            if foreign and not outputs.is_output_folder(self.path):
+            self._refuse_links_and_pipes()
+            names = [
+                path.name for path in self.path.iterdir() if not _may_be_ours(path)
+            ]
+            if names and not outputs.is_output_folder(self.path):
                 raise OptionError(
-                    f"is not empty ({min(foreign)}) and was not made by colmap-affrect",
+                    f"is not empty ({min(names)}) and was not made by colmap-affrect",
                     where=self.path,
                     advice=("give a new or an empty folder as ", Option("output-path")),
                 )
+
+    def _refuse_links_and_pipes(self) -> None:
+        """Refuse what has the name of a file of ours, and leads elsewhere or cannot be read."""
+        for path in self.path.iterdir():
+            stem = path.name.partition(".")[0]
+            if stem in OWN_STEMS or path.name == outputs.LOCK:
+                outputs.refuse_link(path)
+                outputs.refuse_what_waits(path)
 
     def begin(self) -> None:
         """Make the folder, unless it is there, and say in its log whose it is."""

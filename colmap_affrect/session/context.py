@@ -30,12 +30,13 @@ from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.guided_store import GuidedStore
+from colmap_affrect.project.match_store import MatchStore
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 from colmap_affrect.session.view_graph import ViewGraph
