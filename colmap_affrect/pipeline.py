@@ -12,8 +12,8 @@ from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, Option, OptionError
-from colmap_affrect.escalation.climb import climb
 from colmap_affrect.escalation.escalate import escalate
+from colmap_affrect.escalation.map_and_rematch import map_and_rematch
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
@@ -138,7 +138,7 @@ def _run(
                 guide(context, recipe.guided),
             ]
         else:
-            reports += climb(context, mapper, recipe)
+            reports += map_and_rematch(context, mapper, recipe)
         if options.database_descriptors:
             fill_descriptors(workspace.database, context.features)
         return map_and_report(

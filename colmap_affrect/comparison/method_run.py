@@ -33,7 +33,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.errors import AffrectError, ConflictError, Option, damage
-from colmap_affrect.escalation.climb import climb
+from colmap_affrect.escalation.map_and_rematch import map_and_rematch
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -350,7 +350,7 @@ class MethodRun:
             verify_matches(replace(context, progress=SILENT), verification)
             mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
             with watch.step("escalate"):
-                climb(context, mapper, recipe)
+                map_and_rematch(context, mapper, recipe)
         return failures
 
     def _run_seed(self, seed: int) -> SeedResult:

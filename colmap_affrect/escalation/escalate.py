@@ -367,9 +367,10 @@ class Escalation:
     def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
         """Give images the features of a level that they lack, and match pairs with these."""
         missing = self._missing_features(pairs, level)
-        title = f"escalate, {self.context.extraction.levels[level].name}"
+        part = self.context.extraction.levels[level].name
         num_steps = len(missing) + len(pairs)
-        with self.context.progress.stage(title, num_steps, "steps") as advance:
+        stage = self.context.progress.stage
+        with stage("escalate", num_steps, "steps", part) as advance:
             self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, keep, advance)

@@ -490,19 +490,22 @@ class _Cancellable(Progress):
         self._token = token
 
     @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+    def stage(
+        self, name: str, total: int, unit: str, part: str = ""
+    ) -> Iterator[Advance]:
         """Show a stage, and look at the token whenever something is done.
 
         Args:
             name: of the stage.
             total: number of steps.
             unit: what the steps are.
+            part: what is done in this stage now.
 
         Raises:
             InterruptedError: the token is cancelled.
         """
         self._check()
-        with self._shown.stage(name, total, unit) as advance:
+        with self._shown.stage(name, total, unit, part) as advance:
 
             def advance_or_end(count: int) -> None:
                 advance(count)

@@ -142,7 +142,9 @@ def _match_missing(
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
-    with context.progress.stage("match, all features", len(wanted), "pairs") as advance:
+    with context.progress.stage(
+        "match", len(wanted), "pairs", "all features"
+    ) as advance:
         left = _worth_all_features(context, wanted, options, digest)
         advance(len(wanted) - len(left))
         match_pairs(context, left, options, advance)
