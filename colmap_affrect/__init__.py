@@ -26,7 +26,13 @@ if not PYCOLMAP_CAME_FIRST:
 _NAMES_OF_MODULES = {
     # Photographs to a model: everything, the database of others, or one stage after the other.
     "pipeline": ("map_database", "run"),
-    "single_stages": ("choose_pairs", "extract", "map_images", "match", "verify"),
+    "pipeline.single_stages": (
+        "choose_pairs",
+        "extract",
+        "map_images",
+        "match",
+        "verify",
+    ),
     # What a run is made of, and what it returns.
     "colmap.by_hand": ("ByHand",),
     "colmap.verification": ("VerificationOptions",),

@@ -56,6 +56,11 @@ from colmap_affrect.matchers.nearest import NearestOptions as NearestOptions
 from colmap_affrect.pairs.lists import PairOptions as PairOptions
 from colmap_affrect.pipeline import map_database as map_database
 from colmap_affrect.pipeline import run as run
+from colmap_affrect.pipeline.single_stages import choose_pairs as choose_pairs
+from colmap_affrect.pipeline.single_stages import extract as extract
+from colmap_affrect.pipeline.single_stages import map_images as map_images
+from colmap_affrect.pipeline.single_stages import match as match
+from colmap_affrect.pipeline.single_stages import verify as verify
 from colmap_affrect.progress import Progress as Progress
 from colmap_affrect.project.line_report import LineReport as LineReport
 from colmap_affrect.project.reasons import Doubt as Doubt
@@ -73,11 +78,6 @@ from colmap_affrect.report.line_pictures import report_lines as report_lines
 from colmap_affrect.report.run_report import RunReport as RunReport
 from colmap_affrect.session.context import Resources as Resources
 from colmap_affrect.session.run_options import RunOptions as RunOptions
-from colmap_affrect.single_stages import choose_pairs as choose_pairs
-from colmap_affrect.single_stages import extract as extract
-from colmap_affrect.single_stages import map_images as map_images
-from colmap_affrect.single_stages import match as match
-from colmap_affrect.single_stages import verify as verify
 from colmap_affrect.stages.descriptors import match_descriptors as match_descriptors
 from colmap_affrect.stages.descriptors import match_feature_sets as match_feature_sets
 

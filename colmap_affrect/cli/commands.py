@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from colmap_affrect import doctor as examination
-from colmap_affrect import pipeline, single_stages
+from colmap_affrect import pipeline
 from colmap_affrect.cli import given
 from colmap_affrect.colmap import old_databases
 from colmap_affrect.colmap.by_hand import ByHand
@@ -47,6 +47,7 @@ from colmap_affrect.interop import hdf5
 from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
+from colmap_affrect.pipeline import single_stages
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace

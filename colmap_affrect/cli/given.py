@@ -19,12 +19,12 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
+from colmap_affrect.pipeline.single_stages import one_stage
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
 from colmap_affrect.session.context import Context, Resources
-from colmap_affrect.single_stages import one_stage
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 

@@ -62,7 +62,7 @@ def set_values(options: Any, values: Mapping[str, Any]) -> None:
 def resolve(
     options: Any,
     given: Mapping[str, Any],
-    flag: str,
+    option: Words,
     owned: Mapping[str, Words] = OWNED,
 ) -> dict[str, Plain]:
     """Set single values of pycolmap's options.
@@ -71,7 +71,7 @@ def resolve(
         options: of pycolmap, which are changed.
         given: values, which may be text, by key; sections may be left out of a key where its name
             exists once.
-        flag: that they came by, as :class:`colmap_affrect.errors.Option` names it.
+        option: that they came by, for errors.
         owned: what to do instead, by the names of options that cannot be changed so.
 
     Returns:
@@ -81,10 +81,10 @@ def resolve(
         OptionError: names a key that is unknown, ambiguous or ``owned``, or has a wrong value.
     """
     known = flat_values(options)
-    keys = {_full_key(text, known, flag): text for text in given}
+    keys = {_full_key(text, known, option): text for text in given}
     plain = _plain_values(options)
     for key, text in keys.items():
-        where = Option(flag, text)
+        where = (option, f" {text}")
         kind = type(known[key])
         name = _name(key)
         if name in owned:
@@ -95,20 +95,20 @@ def resolve(
             )
         try:
             parsed = _parsed(given[text], known[key])
-            _check_num_threads(name, parsed, Option(flag, f"{text}={parsed}"))
+            _check_num_threads(name, parsed, (option, f" {text}={parsed}"))
             set_values(options, {key: parsed})
         except OptionError:
             raise
         except (TypeError, ValueError, RuntimeError) as error:
             expected = _expected(kind)
             raise OptionError(
-                f"expected {expected}", where=Option(flag, f"{text}={given[text]}")
+                f"expected {expected}", where=(option, f" {text}={given[text]}")
             ) from error
     taken = _plain_values(options)
     return {key: taken[key] for key in keys}
 
 
-def _check_num_threads(name: str, value: Any, where: Option) -> None:
+def _check_num_threads(name: str, value: Any, where: Words) -> None:
     if name == "num_threads" and value > MAX_NUM_THREADS:
         raise OptionError(
             f"at most {MAX_NUM_THREADS}, or -1 for all cores", where=where
@@ -155,19 +155,19 @@ def _name(key: str) -> str:
     return key.rpartition(".")[2]
 
 
-def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
+def _full_key(text: str, known: Mapping[str, Any], option: Words) -> str:
     if text in known:
         return text
     found = [key for key in known if _name(key) == text]
     if len(found) > 1:
         raise OptionError(
             "exists in several sections",
-            where=Option(flag, text),
+            where=(option, f" {text}"),
             advice=f"give {' or '.join(found)}",
         )
     if not found:
         hint = suggestion(text, [*known, *map(_name, known)])
         raise OptionError(
-            f"pycolmap has no such option{hint}", where=Option(flag, text)
+            f"pycolmap has no such option{hint}", where=(option, f" {text}")
         )
     return found[0]

@@ -77,7 +77,7 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
         resolve(
             options=options,
             given=_unusual(_named(given), options),
-            flag=f"{argument}:",
+            option=f"{argument}:",
             owned={},
         )
     else:

@@ -13,7 +13,7 @@ from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.camera_priors import camera_priors
 
-FLAG = "mapper-options"
+FLAG = Option("mapper-options")
 TRACK_LENGTHS = (
     "mapper.track_min_num_views_per_track",
     "mapper.global_positioning.min_num_view_per_track",

@@ -21,7 +21,7 @@ from colmap_affrect.mappers.snapshots import (
 )
 from colmap_affrect.options import within
 
-FLAG = "mapper-options"
+FLAG = Option("mapper-options")
 
 
 class PipelineOptions(MapperOptions):
@@ -67,7 +67,7 @@ class IncrementalMapper:
         if not native.check():
             given = " ".join(f"{key}={value}" for key, value in resolved.items())
             raise OptionError(
-                "COLMAP does not accept these values", where=Option(FLAG, given)
+                "COLMAP does not accept these values", where=(FLAG, f" {given}")
             )
         self.options = options.changed(mapper_options=resolved)
 

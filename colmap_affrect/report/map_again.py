@@ -24,7 +24,7 @@ from colmap_affrect.report.verdict import QUALITIES
 logger = logging.getLogger(__name__)
 
 MapImages = Callable[[ByHand, Progress], RunReport]
-"""Maps the images of a run with what is said by hand, as ``single_stages.map_images`` does."""
+"""Maps the images of a run with what is said by hand, as the stage ``map`` does."""
 
 
 class MapsAgain:

@@ -10,7 +10,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_options import flat_values, resolve, set_values
 from colmap_affrect.errors import OptionError
 
-FLAG = "mapper-options"
+FLAG = "--mapper-options"
 
 
 def options_of(mapper: str) -> object:
@@ -61,7 +61,7 @@ def test_option_that_pycolmap_does_not_take_is_one_clear_line(
     with pytest.raises(OptionError) as error:
         resolve(options_of(mapper), {key: value}, FLAG)
     text = str(error.value)
-    assert text.startswith(f"--{FLAG} {key}")
+    assert text.startswith(f"{FLAG} {key}")
     assert message in text
     assert "\n" not in text
 

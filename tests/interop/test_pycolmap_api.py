@@ -172,7 +172,7 @@ def test_a_database_of_another_program_and_other_photographs_are_refused(
     before = keypoints(sift)
     extract = colmap_affrect.extract_features
     with pytest.raises(
-        DatabaseError, match=r"has other features of a\.png.*from_database"
+        DatabaseError, match=r"has other features of a\.png.*--from-database"
     ):
         extract(sift, photos)
     with pytest.raises(OptionError, match="leave out camera mode"):
