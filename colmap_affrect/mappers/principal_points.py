@@ -168,7 +168,21 @@ def axis_turns_deg(
     Returns:
         By image name the median change of its rotations to the others, in degrees.
     """
-    changed = free.grower(graph).remake(model)
+    return median_turns_deg(model, free.grower(graph).remake(model))
+
+
+def median_turns_deg(
+    model: pycolmap.Reconstruction, changed: pycolmap.Reconstruction
+) -> dict[str, float]:
+    """Return by how much the rotations of a model differ from those of a changed one.
+
+    Args:
+        model: The model.
+        changed: The same images, with other cameras.
+
+    Returns:
+        By image name the median change of its rotations to the others, in degrees.
+    """
     before = _rotations(model)
     after = _rotations(changed)
     both = sorted(before.keys() & after.keys())
