@@ -26,7 +26,6 @@ from colmap_affrect.mappers.camera_priors import (
 from colmap_affrect.mappers.focal_observability import (
     FREE_SIGMA,
     MAX_TRIAL_IMAGES,
-    num_independent,
     with_fewer_points,
 )
 from colmap_affrect.mappers.pair_graph import has_rigs, used_cameras
@@ -49,9 +48,10 @@ def contradicted_principal_points(
     """Find given principal points that the points of a model contradict.
 
     The cost must be lower with free ones by more than free parameters are worth (BIC: Schwarz,
-    Estimating the dimension of a model, 1978): half the logarithm of the number of observations
-    each, of which those in one cell of an image count once. Focal lengths and distortion are free
-    in both adjustments, given or not: what these make up for is not the principal point's.
+    Estimating the dimension of a model, 1978), half the logarithm of the number of observations
+    each, as where nobody has given any (:mod:`colmap_affrect.mappers.principal_points`). Focal
+    lengths and distortion are free in both adjustments, given or not: what these make up for is
+    not the principal point's.
 
     Args:
         model: It stays as it is.
@@ -151,10 +151,9 @@ def _contradictions(
         priors[key] = replace(priors[key], principal_point=_near_given(camera))
     free = pycolmap.Reconstruction(model)
     free_cost = _adjust(free, priors)
-    num = num_independent(constant)
-    share = num / max(1, constant.compute_num_observations())
-    worth = 0.5 * math.log(max(2, num)) * NUM_COORDINATES * len(given)
-    if (constant_cost - free_cost) * share < worth:
+    num_observations = max(2, constant.compute_num_observations())
+    worth = 0.5 * math.log(num_observations) * NUM_COORDINATES * len(given)
+    if constant_cost - free_cost < worth:
         return []
     return _far_ones(given, model, free)
 

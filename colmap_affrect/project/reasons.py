@@ -55,9 +55,8 @@ SENTENCES: dict[DoubtCode, str] = {
         "rotation may be off by {turn_deg:.0f} degrees"
     ),
     "principal_point_contradicted": (
-        "the given principal point does not fit, {given_x_px:.0f},{given_y_px:.0f} px: about "
-        "{fitting_x_px:.0f},{fitting_y_px:.0f} px does, and its rotation may be off by "
-        "{turn_deg:.1f} degrees"
+        "the given principal point does not fit, and its rotation may be off by {turn_deg:.0f} "
+        "degrees"
     ),
     "other_surroundings": (
         "what matches is a part of what it shows, as a poster in two places is: its surroundings, "
