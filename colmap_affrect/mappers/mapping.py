@@ -325,7 +325,8 @@ def _doubt(model: _ScoredModel, name: str, share: float, doubt: Doubt) -> None:
     """
     known = model.confidences.get(name)
     if known:
-        reasons = (doubt, *known.reasons)[:NUM_REASONS]
+        others = known.reasons if known.probability < SURE else ()  # of sure ones: none
+        reasons = (doubt, *others)[:NUM_REASONS]
         model.confidences[name] = replace(
             known, probability=share * known.probability, reasons=reasons
         )
