@@ -146,7 +146,7 @@ def read_record(path: Path) -> dict[str, Any]:
         return {}
     other = f"use another --output-path than {path.parent}"
     with damage(path, mend=f"restore it, or {other}", error_class=WorkspaceError):
-        values = tomllib.loads(read_regular_text(path))
+        values = tomllib.loads(read_regular_text(path, "utf-8-sig"))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
                 f"{path.parent}: was made by another version of colmap-affrect, which cannot be "
