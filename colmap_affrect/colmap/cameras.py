@@ -72,6 +72,7 @@ class CameraRecord:
             "refined_px": self._refined_px(model) if model else None,
             "why": self.why,
             "lens_mm": self.lens_mm,
+            **self._contradicted_principal_point(model),
         }
 
     def _refined_px(self, model: ModelSummary) -> float | None:
@@ -80,6 +81,18 @@ class CameraRecord:
             if name in model.focals_px:
                 return model.focals_px[name]
         return None
+
+    def _contradicted_principal_point(
+        self, model: ModelSummary | None
+    ) -> dict[str, list[float] | None]:
+        """Return the given principal point and a better one where a model contradicts it."""
+        for one in model.principal_point_contradictions if model else ():
+            if not one.turns_deg.keys().isdisjoint(self.names):
+                return {
+                    "given_principal_point_px": list(one.given_px),
+                    "fitting_principal_point_px": list(one.fitting_px),
+                }
+        return {"given_principal_point_px": None, "fitting_principal_point_px": None}
 
     @property
     def is_all_given(self) -> bool:

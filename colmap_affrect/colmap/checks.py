@@ -259,9 +259,10 @@ def _check_keypoints(
 
 
 def _size_of(tables: Tables, image_id: int) -> tuple[int, int] | None:
-    """Return (width, height) of an image in px, None where its camera is missing."""
+    """Return (width, height) of an image in px, None where no camera has one."""
     camera = tables.cameras.get(tables.camera_ids[image_id])
-    return (camera.width, camera.height) if camera else None
+    has_size = camera and min(camera.width, camera.height) > 0
+    return (camera.width, camera.height) if camera and has_size else None
 
 
 def _check_descriptors(

@@ -4,6 +4,7 @@ Everything is checked before it is written: an index out of range would later en
 """
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -45,6 +46,11 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         ) from error
     except RuntimeError as error:
         require_space(path, BYTES_OF_EMPTY_DATABASE)
+        if path.exists() and not os.access(path, os.W_OK):
+            raise DatabaseError(
+                f"{path}: cannot be written (it is read-only); permit that, and run the same "
+                "command again"
+            ) from error
         raise DatabaseError(
             f"not a usable COLMAP database, or in use by another program ({error})",
             where=path,

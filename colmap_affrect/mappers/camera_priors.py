@@ -1,8 +1,8 @@
 """What is known of cameras before mapping: focal length, principal point, distortion.
 
 The logarithm of a focal length is normal, and so is the principal point. What the user gives is
-held. EXIF, the straight lines of photographs (:mod:`colmap_affrect.geometry.lines`) and lenses as
-they usually are say the rest, each as a distribution; their product is the prior. Adjustments
+constant. EXIF, the straight lines of photographs (:mod:`colmap_affrect.geometry.lines`) and lenses
+as they usually are say the rest, each as a distribution; their product is the prior. Adjustments
 (:mod:`colmap_affrect.mappers.adjustment`) and scores (:mod:`colmap_affrect.mappers.model_score`)
 use the same one.
 """
@@ -93,7 +93,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class PrincipalPointPrior:
-    """What is known of a principal point that is not held."""
+    """What is known of a principal point that is not constant."""
 
     center_px: tuple[float, float]
     sigmas_px: tuple[float, float]
@@ -110,8 +110,8 @@ class CameraPrior:
     """What is known of the intrinsics of a camera."""
 
     focal_px: float  # median of the focal length
-    sigma: float  # standard deviation of its logarithm; 0 where it is given and held
-    principal_point: PrincipalPointPrior | None = None  # None where it is held
+    sigma: float  # standard deviation of its logarithm; 0 where it is constant
+    principal_point: PrincipalPointPrior | None = None  # None where it is constant
     has_distortion: bool = True  # whether distortion is refined; else it stays as it is
     given_starts_px: tuple[float, ...] = field(default=(), compare=False)
     """Focal lengths near which models begin, the likeliest first; the median alone where empty."""
@@ -122,9 +122,9 @@ class CameraPrior:
         return self.given_starts_px or (self.focal_px,)
 
     @property
-    def is_unknown(self) -> bool:
-        """Whether neither the user nor EXIF tells the focal length."""
-        return self.sigma > EXIF_SIGMA
+    def has_prior_focal_length(self) -> bool:
+        """Whether the user or EXIF tells the focal length, as COLMAP says of cameras."""
+        return self.sigma <= EXIF_SIGMA
 
     def cost(self, focal_px: float) -> float:
         """Return how much a focal length costs, in nats."""
@@ -148,7 +148,7 @@ class CameraPrior:
 def with_distortion_of(
     priors: Mapping[int, CameraPrior], cameras: Iterable[pycolmap.Camera]
 ) -> dict[int, CameraPrior]:
-    """Return the priors of the cameras of a model, which hold distortion where that was held.
+    """Return the priors of the cameras of a model, whose distortion is constant where that was.
 
     Args:
         priors: By camera id.
@@ -157,7 +157,9 @@ def with_distortion_of(
     is_straight = {camera.camera_id: camera.is_undistorted() for camera in cameras}
     return {
         key: replace(
-            prior, has_distortion=not (prior.is_unknown and is_straight.get(key, False))
+            prior,
+            has_distortion=prior.has_prior_focal_length
+            or not is_straight.get(key, False),
         )
         for key, prior in priors.items()
     }
@@ -258,7 +260,7 @@ def _starts(focal_px: LogNormal) -> tuple[float, ...]:
 def _principal_point(
     camera: pycolmap.Camera, record: CameraRecord | None, lines: Sequence[LineCamera]
 ) -> PrincipalPointPrior | None:
-    """Return what is known of a principal point, None where it is held.
+    """Return what is known of a principal point, None where it is constant.
 
     It is free in crops, where lines tell that it is not in the middle, and where mapping has found
     that (:mod:`colmap_affrect.mappers.principal_points`).

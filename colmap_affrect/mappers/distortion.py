@@ -74,6 +74,6 @@ def straighten(
         priors: What is known of them, by camera id.
     """
     for camera in used_cameras(model).values():
-        if priors[camera.camera_id].is_unknown:
+        if not priors[camera.camera_id].has_prior_focal_length:
             for index in camera.extra_params_idxs():
                 camera.params[index] = 0.0

@@ -120,7 +120,7 @@ def focal_growths(
     priors = camera_priors(cameras, task.cameras, task.lines)
     priors = with_distortion_of(priors, cameras)
     recorded = sorted(priors.keys() & task.cameras.keys())
-    unknown = [key for key in recorded if priors[key].is_unknown]
+    unknown = [key for key in recorded if not priors[key].has_prior_focal_length]
     if not unknown or not _is_tried(model):
         return {}
     fixed = frozenset(key for key in recorded if task.cameras[key].is_all_given)

@@ -25,6 +25,7 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
+from colmap_affrect.mappers.given_principal_points import contradicted_principal_points
 from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
@@ -34,7 +35,12 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
-from colmap_affrect.mappers.reliability import NUM_REASONS, Confidence, score_images
+from colmap_affrect.mappers.reliability import (
+    NUM_REASONS,
+    Confidence,
+    score_images,
+    share_within_limit,
+)
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
 from colmap_affrect.mappers.surroundings import apart, places_of
@@ -43,7 +49,13 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.regular_files import read_regular
-from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary, kept_probability
+from colmap_affrect.project.report import (
+    DOUBTFUL,
+    SURE,
+    ModelSummary,
+    PrincipalPointContradiction,
+    kept_probability,
+)
 
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
@@ -121,6 +133,7 @@ class _ScoredModel:
     confidences: dict[str, Confidence] = field(default_factory=dict)
     # Of images that it has lost
     taken_out: dict[str, Confidence] = field(default_factory=dict)
+    contradictions: Sequence[PrincipalPointContradiction] = ()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -284,6 +297,23 @@ def _doubt_motion(model: _ScoredModel, task: MappingTask) -> None:
             _doubt(model, name, share, doubt)
 
 
+def _doubt_given_principal_points(scored: _ScoredModel, task: MappingTask) -> None:
+    """Doubt rotations that hang on given principal points which the points contradict."""
+    model = scored.mapped.reconstruction
+    scored.contradictions = contradicted_principal_points(model, task)
+    for one in scored.contradictions:
+        for name, turn_deg in one.turns_deg.items():
+            values = {
+                "given_x_px": one.given_px[0],
+                "given_y_px": one.given_px[1],
+                "fitting_x_px": one.fitting_px[0],
+                "fitting_y_px": one.fitting_px[1],
+                "turn_deg": turn_deg,
+            }
+            doubt = Doubt("principal_point_contradicted", {**values})
+            _doubt(scored, name, share_within_limit(turn_deg), doubt)
+
+
 def _doubt(model: _ScoredModel, name: str, share: float, doubt: Doubt) -> None:
     """Multiply the probability of an image, if it is there.
 
@@ -295,7 +325,8 @@ def _doubt(model: _ScoredModel, name: str, share: float, doubt: Doubt) -> None:
     """
     known = model.confidences.get(name)
     if known:
-        reasons = (doubt, *known.reasons)[:NUM_REASONS]
+        others = known.reasons if known.probability < SURE else ()  # of sure ones: none
+        reasons = (doubt, *others)[:NUM_REASONS]
         model.confidences[name] = replace(
             known, probability=share * known.probability, reasons=reasons
         )
@@ -324,6 +355,7 @@ def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredMode
             is_stale = False
         else:
             scored.confidences = _no_surer_than_ties(confidences, mapped, task)
+            _doubt_given_principal_points(scored, task)
             return scored
     return scored
 
@@ -452,6 +484,7 @@ def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
         hypotheses=scored.mapped.hypotheses,
         tie_points=tie_points_of(task, graph).report(model),
         one_view=_same_viewpoint_names(model, graph, task),
+        principal_point_contradictions=tuple(scored.contradictions),
     )
 
 

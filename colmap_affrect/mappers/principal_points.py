@@ -1,6 +1,6 @@
 """Models whose principal points are not in the middle of their images.
 
-Prints are cut off centre, and view cameras shift their lens. A model with held principal points
+Prints are cut off centre, and view cameras shift their lens. A model with constant principal points
 makes up for that by wrong rotations, focal lengths and above all distortion, which keeps it where
 it is once the principal points are free. So the lens is taken for straight at first, and errors
 count from far away, less and less (graduated non-convexity: Blake and Zisserman, Visual
@@ -54,7 +54,7 @@ def with_free_principal_points(
     of them are cut in the same way.
 
     Args:
-        search: The same with principal points that are held.
+        search: The same with principal points that are constant.
         records: What is on record of the cameras, by camera id.
 
     Returns:
@@ -66,11 +66,11 @@ def with_free_principal_points(
     for camera in cameras:
         key = camera.camera_id
         is_own = num_images[key] == 1
-        is_held = priors[key].principal_point is None
-        is_unknown = priors[key].is_unknown and has_free_center(
+        is_constant = priors[key].principal_point is None
+        is_unknown = not priors[key].has_prior_focal_length and has_free_center(
             camera, records.get(key)
         )
-        if is_own and is_held and is_unknown:
+        if is_own and is_constant and is_unknown:
             principal_point = shifted_principal_point(camera)
             priors[key] = replace(priors[key], principal_point=principal_point)
     if priors == search.adjuster.priors:
@@ -78,8 +78,10 @@ def with_free_principal_points(
     return _with_priors(search, priors)
 
 
-def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) -> bool:
-    """Tell whether the points of a model say that principal points are not where they are held.
+def contradict_constant(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> bool:
+    """Tell whether the points of a model say that constant principal points are wrong.
 
     The cost with free ones must be lower by more than free parameters are worth (BIC: Schwarz,
     Estimating the dimension of a model, 1978), half the logarithm of the number of observations
@@ -89,8 +91,8 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
     sign: all also begin with a straight one.
 
     Args:
-        model: With held principal points; it stays as it is.
-        held: The search that made it.
+        model: With constant principal points; it stays as it is.
+        constant: The search that made it.
         free: The search with free principal points.
     """
     num_observations = with_fewer_points(model).compute_num_observations()
@@ -99,16 +101,16 @@ def contradict_held(model: pycolmap.Reconstruction, held: Search, free: Search) 
     freed = set[int]()
     for key in used_cameras(model):
         prior = free.adjuster.priors[key]
-        if prior.principal_point and not held.adjuster.priors[key].principal_point:
+        if prior.principal_point and not constant.adjuster.priors[key].principal_point:
             freed.add(key)
     per_parameter = 0.5 * math.log(num_observations)
-    held_cost = min(held.costs_of_starts(model))
+    constant_cost = min(constant.costs_of_starts(model))
     crop_cost = min(free.costs_of_starts(model))
-    if held_cost - crop_cost > 2 * len(freed) * per_parameter:
+    if constant_cost - crop_cost > 2 * len(freed) * per_parameter:
         return True
     shifted = _only_up_and_down(free, freed)
     shift_cost = min(shifted.costs_of_starts(model))
-    return held_cost - shift_cost > len(freed) * per_parameter
+    return constant_cost - shift_cost > len(freed) * per_parameter
 
 
 def _only_up_and_down(free: Search, freed: Set[int]) -> Search:
@@ -136,7 +138,7 @@ def with_shifted_axes(
     """Return a model with free principal points.
 
     Args:
-        model: With held principal points; it stays as it is.
+        model: With constant principal points; it stays as it is.
         free: The search with free principal points.
         graph: Pairs that the model is made from.
     """
@@ -145,7 +147,7 @@ def with_shifted_axes(
     straight = dict[int, CameraPrior]()
     for key, prior in free.adjuster.priors.items():
         straight[key] = replace(
-            prior, has_distortion=prior.has_distortion and not prior.is_unknown
+            prior, has_distortion=prior.has_distortion and prior.has_prior_focal_length
         )
     for factor in NOISE_FACTORS:
         coarse = _coarser(_with_priors(free, straight), factor)
@@ -161,14 +163,28 @@ def axis_turns_deg(
     """Return how far rotations change where principal points are freed in a model as it is.
 
     Args:
-        model: With held principal points; it stays as it is.
+        model: With constant principal points; it stays as it is.
         free: The search with free principal points.
         graph: Pairs that the model is made from.
 
     Returns:
         By image name the median change of its rotations to the others, in degrees.
     """
-    changed = free.grower(graph).remake(model)
+    return median_turns_deg(model, free.grower(graph).remake(model))
+
+
+def median_turns_deg(
+    model: pycolmap.Reconstruction, changed: pycolmap.Reconstruction
+) -> dict[str, float]:
+    """Return by how much the rotations of a model differ from those of a changed one.
+
+    Args:
+        model: The model.
+        changed: The same images, with other cameras.
+
+    Returns:
+        By image name the median change of its rotations to the others, in degrees.
+    """
     before = _rotations(model)
     after = _rotations(changed)
     both = sorted(before.keys() & after.keys())

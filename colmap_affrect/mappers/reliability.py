@@ -239,11 +239,11 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
         )
         losses.append(_Loss(math.log1p(odds), edge))
     if features.direction_sigma_deg:
-        share = _share_within_limit(features.direction_sigma_deg)
+        share = share_within_limit(features.direction_sigma_deg)
         near = Doubt("near_others", {"sigma_deg": features.direction_sigma_deg})
         losses.append(_Loss(-math.log(share), near))
     if features.axis_turn_deg:
-        share = _share_within_limit(features.axis_turn_deg)
+        share = share_within_limit(features.axis_turn_deg)
         unclear = Doubt("axis_unclear", {"turn_deg": features.axis_turn_deg})
         losses.append(_Loss(-math.log(share), unclear))
     return losses
@@ -259,10 +259,10 @@ def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
 def _precision_factor(features: ReliabilityFeatures) -> float:
     """Return the probability that what is left open moves a pose by less than the limit."""
     sigma_deg = math.hypot(features.direction_sigma_deg, features.axis_turn_deg)
-    return _share_within_limit(sigma_deg)
+    return share_within_limit(sigma_deg)
 
 
-def _share_within_limit(sigma_deg: float) -> float:
+def share_within_limit(sigma_deg: float) -> float:
     """Return the probability of an error below the limit of right poses.
 
     Both angles of a direction are normal, with half of the variance each.

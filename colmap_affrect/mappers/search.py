@@ -222,7 +222,11 @@ class Search:
     def unknown(self) -> dict[int, CameraPrior]:
         """Priors of the unknown focal lengths, by camera id."""
         priors = self.adjuster.priors
-        return {key: prior for key, prior in priors.items() if prior.is_unknown}
+        return {
+            key: prior
+            for key, prior in priors.items()
+            if not prior.has_prior_focal_length
+        }
 
     @cached_property
     def _shared(self) -> set[int]:

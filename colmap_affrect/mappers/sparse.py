@@ -22,7 +22,7 @@ from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
-    contradict_held,
+    contradict_constant,
     principal_point_cost,
     with_free_principal_points,
     with_shifted_axes,
@@ -248,7 +248,9 @@ class SparseMapper(IncrementalMapper):
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
         told = cameras_that_tell_distortion(graph)
         return {
-            key: replace(prior, has_distortion=key in told or not prior.is_unknown)
+            key: replace(
+                prior, has_distortion=key in told or prior.has_prior_focal_length
+            )
             for key, prior in priors.items()
         }
 
@@ -413,7 +415,7 @@ class _HypothesisTest:
             return
         free = with_free_principal_points(search, self.task.cameras)
         model = self.best[0].reconstruction
-        if free is None or not contradict_held(model, search, free):
+        if free is None or not contradict_constant(model, search, free):
             return
         changed = with_shifted_axes(model, free, search.graph)
         share = self._motion_share(self.best[0])

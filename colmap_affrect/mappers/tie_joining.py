@@ -104,7 +104,7 @@ class TieJoiner:
             cameras = {i: copy.copy(graph.cameras[i]) for i in ids}
             for image_id, camera in list(cameras.items()):
                 prior = self.grower.adjuster.priors[camera.camera_id]
-                if prior.is_unknown:
+                if not prior.has_prior_focal_length:
                     cameras[image_id] = _with_focal(camera, prior.starts_px[0])
             points = []
             for image_id in ids:
@@ -238,7 +238,7 @@ class TieJoiner:
         is_used = key in {camera.camera_id for camera in cameras_of(model).values()}
         camera = (model if is_used else self.grower.graph.cache).cameras[key]
         prior = self.grower.adjuster.priors[key]
-        is_open = not is_used and prior.is_unknown
+        is_open = not is_used and not prior.has_prior_focal_length
         trials = [copy.copy(camera)]
         if is_open:
             trials = [_with_focal(camera, focal_px) for focal_px in prior.starts_px]

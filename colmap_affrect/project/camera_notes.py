@@ -45,6 +45,7 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
     notes = []
     for contradiction in CONTRADICTIONS:
         notes += _contradiction_notes(cameras, contradiction)
+    notes += _principal_point_notes(cameras)
     estimated = list(filter(_is_estimated, cameras))
     num_estimates = len({camera["refined_px"] for camera in estimated})
     if num_estimates < len(estimated):
@@ -77,6 +78,25 @@ def _contradiction_notes(
         f"{contradiction.what} may be wrong: {known_px:.0f} px {contradiction.by}, "
         f"{estimated_px:.0f} px in the model{more}; {contradiction.remedy}"
     ]
+
+
+def _principal_point_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line where points of the model contradict given principal points."""
+    wrong = [camera for camera in cameras if camera.get("fitting_principal_point_px")]
+    if not wrong:
+        return []
+    given_px = _point_text(wrong[0]["given_principal_point_px"])
+    fitting_px = _point_text(wrong[0]["fitting_principal_point_px"])
+    more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+    return [
+        f"the given principal point may be wrong: {given_px} px given, about {fitting_px} px fits "
+        f"better{more}; give another one, or none"
+    ]
+
+
+def _point_text(point_px: Sequence[float]) -> str:
+    """Return a point as --principal-point takes it."""
+    return f"{point_px[0]:.0f},{point_px[1]:.0f}"
 
 
 def merge_shared_cameras(

@@ -21,6 +21,7 @@ DoubtCode = Literal[
     "bridge_edge",
     "near_others",
     "axis_unclear",
+    "principal_point_contradicted",
     "other_surroundings",
     "two_places",
     "hangs_on",
@@ -52,6 +53,10 @@ SENTENCES: dict[DoubtCode, str] = {
     "axis_unclear": (
         "points say that optical axes are off the middle of photographs, but not where: its "
         "rotation may be off by {turn_deg:.0f} degrees"
+    ),
+    "principal_point_contradicted": (
+        "the given principal point does not fit, and its rotation may be off by {turn_deg:.0f} "
+        "degrees"
     ),
     "other_surroundings": (
         "what matches is a part of what it shows, as a poster in two places is: its surroundings, "

@@ -150,7 +150,7 @@ def read_record(path: Path) -> dict[str, Any]:
         f" than {path.parent}",
     )
     with damage(path, mend, WorkspaceError):
-        values = tomllib.loads(read_regular_text(path))
+        values = tomllib.loads(read_regular_text(path, "utf-8-sig"))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
                 "was made by another version of colmap-affrect, which cannot be gone "

@@ -221,6 +221,19 @@ class Residual:
 
 @documented
 @dataclass(frozen=True)
+class PrincipalPointContradiction:
+    """A principal point of the user that the points of a model contradict, in COLMAP's px."""
+
+    given_px: tuple[float, float]
+    """What the user gives."""
+    fitting_px: tuple[float, float]
+    """What fits better, roughly."""
+    turns_deg: dict[str, float]
+    """By the name of each image: how far its rotation changes with that, in degrees."""
+
+
+@documented
+@dataclass(frozen=True)
 class ModelSummary:
     """One COLMAP model; mappings are by image name."""
 
@@ -252,6 +265,8 @@ class ModelSummary:
     """Residuals of the tie points by hand, the worst first."""
     one_view: tuple[tuple[str, str], ...] = ()
     """Pairs of prints of one negative, or of photographs from one place."""
+    principal_point_contradictions: tuple[PrincipalPointContradiction, ...] = ()
+    """Principal points of the user that the points contradict."""
 
     @property
     def sure(self) -> tuple[str, ...]:

@@ -55,12 +55,12 @@ class Drawn:
         Raises:
             OptionError: something else was sent, or a photograph is not there.
         """
-        if not isinstance(content, dict):
+        if not isinstance(content, dict) or not {"marks", "masks"} <= content.keys():
             raise OptionError(
                 "the page sent no marks and masks", advice="load it again"
             )
-        rows = content.get("marks", [])
-        pictures = content.get("masks", {})
+        rows = content["marks"]
+        pictures = content["masks"]
         if not (isinstance(rows, list) and isinstance(pictures, dict)):
             raise OptionError(
                 "the page sent no marks and masks", advice="load it again"

@@ -40,6 +40,9 @@ SCRIPTS_BEGIN = "script-src"
 MAX_NUM_BYTES = (
     64 << 20
 )  # of what a page sends: masks of some hundred photographs; resource
+MAX_DIGITS = (
+    19  # of the length of what a page sends: more are no number of bytes; format
+)
 TIMEOUT_S = 30.0  # of a browser that says nothing more; resource
 NUM_TOKEN_BYTES = 16  # nobody guesses that; theory
 
@@ -190,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_page(self) -> None:
         try:
-            page = self.server.workspace.page.read_text(encoding="utf-8")
+            page = self.server.workspace.page.read_text("utf-8", errors="replace")
         except OSError:
             why = "the page is being written anew: load it again in a moment"
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, why)
@@ -203,15 +206,19 @@ class _Handler(BaseHTTPRequestHandler):
     def _begin_mapping(self) -> None:
         """Begin to map with what was sent, and say whether that was possible."""
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > MAX_NUM_BYTES:
-            self.close_connection = True
-            answer = {"error": f"more than {MAX_NUM_BYTES >> 20} MB of masks"}
-            self._send_json(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, answer)
+        if not length.isdecimal():
+            self._refuse_content(
+                HTTPStatus.LENGTH_REQUIRED, "how long it is, is not said"
+            )
+            return
+        if len(length) > MAX_DIGITS or int(length) > MAX_NUM_BYTES:
+            why = f"more than {MAX_NUM_BYTES >> 20} MB of masks"
+            self._refuse_content(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, why)
             return
         try:
             content = json.loads(self.rfile.read(int(length)))
             has_begun = self.server.mapping.begin(content)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             self._send_json(HTTPStatus.BAD_REQUEST, {"error": f"not JSON: {error}"})
         except AffrectError as error:
             answer = {"error": one_line(with_flags(error.words))}
@@ -220,6 +227,11 @@ class _Handler(BaseHTTPRequestHandler):
             status = HTTPStatus.ACCEPTED if has_begun else HTTPStatus.CONFLICT
             why = "" if has_begun else "it maps already; wait until that is done"
             self._send_json(status, {"error": why})
+
+    def _refuse_content(self, status: HTTPStatus, why: str) -> None:
+        """Answer without reading what was sent."""
+        self.close_connection = True
+        self._send_json(status, {"error": why})
 
     def _send_json(self, status: HTTPStatus, content: dict[str, Any]) -> None:
         self._send(status, json.dumps(content), "application/json")

@@ -112,6 +112,10 @@ class CameraEntry(Described):
     """What was decided on the camera, and for what reason."""
     lens_mm: float
     """Focal length in mm by EXIF, where the size of the sensor is not known; else 0."""
+    given_principal_point_px: tuple[float, float] | None
+    """What the user gives where the points of the largest model contradict it; else null."""
+    fitting_principal_point_px: tuple[float, float] | None
+    """What then fits better, roughly."""
 
 
 class ReportFile(Described):

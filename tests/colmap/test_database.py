@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from strategies import Array
 from synthetic import blobs, texture, write_image
 
+from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
@@ -227,6 +228,24 @@ def test_write_matches_refuses_what_would_crash_colmap(
             write_matches(database, *pair, matches)
         assert database.num_matches() == 0
         assert database.num_matched_image_pairs() == 0
+
+
+def test_database_that_is_read_only_is_called_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    path.write_bytes(b"")
+    monkeypatch.setattr(colmap_database, "_open_when_free", refuses_to_open)
+    monkeypatch.setattr(colmap_database.os, "access", lambda *_: False)
+    with (
+        pytest.raises(DatabaseError, match="it is read-only"),
+        colmap_database.open_database(path),
+    ):
+        pass
+
+
+def refuses_to_open(_: Path) -> None:
+    raise RuntimeError("No registered database factory succeeded.")
 
 
 def test_what_is_no_database_is_one_clear_line(tmp_path: Path) -> None:

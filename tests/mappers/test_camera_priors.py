@@ -87,7 +87,7 @@ def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> 
     prior = camera_prior(camera(), NOTHING, said)
     assert prior.focal_px == pytest.approx(900.0, rel=0.04)
     assert LINES_SIGMA <= prior.sigma < 0.2
-    assert prior.is_unknown
+    assert not prior.has_prior_focal_length
     assert prior.starts_px == (prior.focal_px,)
     exif = replace(NOTHING, source="exif")
     assert camera_prior(camera(), exif, said) == CameraPrior(1200.0, EXIF_SIGMA)

@@ -26,7 +26,7 @@ from colmap_affrect.mappers.camera_priors import (
 from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.principal_points import (
-    contradict_held,
+    contradict_constant,
     with_free_principal_points,
 )
 from colmap_affrect.mappers.search import Search
@@ -110,14 +110,14 @@ def test_axes_off_the_middle_are_found_and_better_rotations_with_them(
 ) -> None:
     path = tmp_path / "database.db"
     truth = write_prints(path, 1.0)
-    held_record = replace(UNKNOWN, given=("principal-point",))
-    held = mapped(path, records_of(truth, held_record))
+    constant_record = replace(UNKNOWN, given=("principal-point",))
+    constant = mapped(path, records_of(truth, constant_record))
     free = mapped(path, records_of(truth, UNKNOWN))
     assert SHIFTED_AXES in free.hypotheses
     assert free.reconstruction.num_reg_images() == NUM_IMAGES
-    held_errors_deg = rotation_errors_deg(held.reconstruction, truth)
+    constant_errors_deg = rotation_errors_deg(constant.reconstruction, truth)
     free_errors_deg = rotation_errors_deg(free.reconstruction, truth)
-    assert max(free_errors_deg) < 0.6 * max(held_errors_deg)
+    assert max(free_errors_deg) < 0.6 * max(constant_errors_deg)
     for image in free.reconstruction.images.values():
         true_center = np.array(SIZE) / 2.0 + OFFSETS_PX[image.image_id - 1]
         assert np.abs(center_of(image.camera) - true_center).max() < 80.0
@@ -210,8 +210,8 @@ def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
     native = mapper_of("sparse").native(task, 0)
     priors = camera_priors(graph.cameras.values(), task.cameras, {})
     adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
-    held = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
-    free = with_free_principal_points(held, task.cameras)
+    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    free = with_free_principal_points(constant, task.cameras)
     assert free is not None
     unit = 3 * 0.5 * math.log(truth.compute_num_observations())
 
@@ -227,4 +227,4 @@ def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
         return 1000.0 - share * unit, 2000.0
 
     monkeypatch.setattr(Search, "costs_of_starts", costs)
-    assert contradict_held(truth, held, free) == contradict
+    assert contradict_constant(truth, constant, free) == contradict

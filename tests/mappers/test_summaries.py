@@ -12,7 +12,11 @@ from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.mapping import read_summary, write_summary
 from colmap_affrect.project.reasons import Doubt
-from colmap_affrect.project.report import Bridge, ModelSummary
+from colmap_affrect.project.report import (
+    Bridge,
+    ModelSummary,
+    PrincipalPointContradiction,
+)
 
 MODEL = ModelSummary(
     registered_names=("a.jpg", "č.jpg"),
@@ -27,6 +31,9 @@ MODEL = ModelSummary(
     taken_out={"d.jpg": (Doubt("no_parallax", {"share": 0.9}),)},
     focals_px={"a.jpg": 812.5, "č.jpg": 900.0},
     one_view=(("a.jpg", "č.jpg"),),
+    principal_point_contradictions=(
+        PrincipalPointContradiction((320.0, 368.0), (322.0, 243.0), {"a.jpg": 3.5}),
+    ),
 )
 
 

@@ -179,10 +179,44 @@ def test_what_is_too_large_is_not_read(
 def test_what_is_no_mark_and_no_mask_is_refused_in_one_line(
     server: PageServer, content: object, words: str
 ) -> None:
-    status, text = ask(server, "map", "POST", content, Origin=own(server))
+    sent = content
+    if isinstance(content, dict):
+        sent = {"marks": [], "masks": {}, **content}
+    status, text = ask(server, "map", "POST", sent, Origin=own(server))
     assert status == 400
     assert words in json.loads(text)["error"]
     assert not (server.workspace.path / "by-hand").exists()
+
+
+NESTED = b"[" * 100_000
+ODD_CONTENTS = [
+    (NESTED, len(NESTED), 400),
+    (b"{}", "9" * 5000, 413),
+    (b"{}", "-2", 411),
+    (b"\xff\xfe\xff", 3, 400),
+    (b'{"a": 1}', 8, 400),  # else what was drawn before would be gone
+    (b'{"marks": []}', 13, 400),
+]
+
+
+@pytest.mark.parametrize(("content", "length", "status"), ODD_CONTENTS)
+def test_what_no_page_sends_is_answered_and_changes_nothing(
+    server: PageServer, content: bytes, length: object, status: int
+) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    headers = {"Content-Length": f"{length}", "Origin": own(server)}
+    connection.request("POST", f"/{server.token}/map", content, headers)
+    assert connection.getresponse().status == status
+    connection.close()
+    assert not server.mapping.is_running
+    assert not (server.workspace.path / "by-hand").exists()
+
+
+def test_a_page_that_is_no_text_is_served_as_far_as_it_is(server: PageServer) -> None:
+    server.workspace.page.write_bytes(b"\xff<body>rest of a page</body>")
+    status, text = ask(server)
+    assert status == 200
+    assert "rest of a page" in text
 
 
 def white_mask() -> bytes:

@@ -37,7 +37,15 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> RunReport:
     return replace(
         small,
         models=(replace(mapped, one_view=((NAMES[0], NAMES[1]),)),),
-        cameras=({**camera, "focal_longer_sides": 1.25, "lens_mm": 0.0},),
+        cameras=(
+            {
+                **camera,
+                "focal_longer_sides": 1.25,
+                "lens_mm": 0.0,
+                "given_principal_point_px": [320.0, 368.0],
+                "fitting_principal_point_px": [322.0, 243.0],
+            },
+        ),
         mapping={**small.mapping, "random_seed": 0},
         verification={**small.verification, "random_seed": 0},
         photographs=found,
@@ -80,3 +88,10 @@ def test_contradicted_focal_lengths_are_told_in_the_terminal(report: RunReport) 
     text = report.summary()
     assert "the focal length from EXIF is 900 px, straight lines tell 1,400 px" in text
     assert "--ignore-exif leaves it out" in text
+
+
+def test_contradicted_principal_points_are_told_in_the_terminal(
+    report: RunReport,
+) -> None:
+    line = "the given principal point may be wrong: 320,368 px given, about 322,243 px fits"
+    assert line in report.summary()

@@ -41,6 +41,8 @@ ROWS = [
         "(qvec and tvec of pair",
     ),
     ("UPDATE cameras SET width = 'wide'", "damaged"),
+    ("UPDATE cameras SET width = 0", "of a size that no photograph has"),
+    ("UPDATE cameras SET height = -5", "of a size that no photograph has"),
     (
         "UPDATE rigs SET ref_sensor_type = 1",
         "frames that hold images twice, or of other cameras",
