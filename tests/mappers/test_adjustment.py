@@ -30,6 +30,18 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
     return synthesize(path, num_rigs=4, num_points3D=150, noise_px=0.5)
 
 
+@pytest.mark.parametrize(("num_points", "min_track_length"), [(60, 2), (200, 3)])
+def test_tracks_of_two_are_left_out_where_all_images_see_a_hundred_longer_ones(
+    tmp_path: Path, num_points: int, min_track_length: int
+) -> None:
+    seen_by_all = synthesize(
+        tmp_path / "database.db", num_rigs=4, num_points3D=num_points
+    )
+    priors = dict.fromkeys(seen_by_all.cameras, CameraPrior(TRUE_FOCAL, 0.1))
+    adjuster = Adjuster(priors, 0.5, pycolmap.BundleAdjustmentOptions())
+    assert adjuster._options(seen_by_all, ()).min_track_length == min_track_length
+
+
 def mean_distortion(model: pycolmap.Reconstruction, noise_px: float) -> float:
     """Adjust a copy of a model, with known focal lengths, to keypoints of some noise."""
     trial = pycolmap.Reconstruction(model)

@@ -16,7 +16,13 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers import pair_graph
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import (
+    PairGraph,
+    VerifiedPair,
+    _strongest,
+    cameras_of,
+    poses_of,
+)
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
 
@@ -186,6 +192,17 @@ def test_only_the_strongest_pairs_of_an_image_score_models(tmp_path: Path) -> No
     assert min(counts.values()) == 15
     assert graph.weak
     assert len(graph.verified) == 190
+
+
+def test_a_pair_scores_models_that_is_among_the_strongest_of_one_of_its_images() -> (
+    None
+):
+    matches = np.zeros((20, 2), np.int64)
+    geometry = pycolmap.TwoViewGeometry()
+    star = [VerifiedPair((1, leaf), matches, geometry) for leaf in range(2, 22)]
+    strong, weak = _strongest(star)
+    assert len(strong) == 20
+    assert not weak
 
 
 def test_pairs_of_fewer_than_fifteen_inliers_are_left_out(tmp_path: Path) -> None:
