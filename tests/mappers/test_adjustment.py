@@ -114,6 +114,17 @@ def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
             )
 
 
+def test_a_distortion_of_a_seventh_costs_as_much_as_two_deviations() -> None:
+    distorted = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE
+    )
+    distorted.params = [TRUE_FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.14]
+    cost = IntrinsicsCost(distorted, CameraPrior(TRUE_FOCAL, 0.3), 0.5, constant=[])
+    residuals = np.zeros(4)
+    assert cost.Evaluate([distorted.params], residuals, None)
+    assert residuals == pytest.approx([0.0, 0.0, 0.0, 2.0 * 0.5])
+
+
 def test_focal_lengths_without_information_go_to_their_prior_also_from_far_away(
     model: pycolmap.Reconstruction,
 ) -> None:
