@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.escalation.set_state import SetState
+from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.escalation.set_state import SetState, _megapixels
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, ModelSummary
 from colmap_affrect.recipes import EscalateOptions
@@ -43,3 +44,44 @@ def test_an_image_that_is_likely_right_weighs_a_quarter_of_what_it_may_gain() ->
     assert weights == pytest.approx(
         {"doubtful.jpg": 0.8, "likely.jpg": 0.05, "missing.jpg": 1.0}
     )
+
+
+def test_inliers_of_a_pair_are_found_whichever_image_is_the_first() -> None:
+    state = state_of(NAMES, ())
+    listed = [("a", "b"), ("a", "c"), ("b", "c")]
+    context: Any = state.context
+    context.num_verified_inliers = lambda: {("a", "b"): 20, ("c", "a"): 30}
+    context.usable = lambda _: listed
+    assert state.num_inliers() == {("a", "b"): 20, ("a", "c"): 30, ("b", "c"): 0}
+
+
+def test_images_that_measured_frames_connect_to_likely_ones_are_anchored() -> None:
+    state = state_of(NAMES, ())
+    state.is_measured = [True, False]
+    model = ModelSummary(
+        registered_names=("likely", "measured", "learned", "unverified"),
+        num_points3D=90,
+        mean_track_length=3.0,
+        mean_reprojection_error_px=0.5,
+        doubtful={
+            name: (Doubt("few_matches"),)
+            for name in ("measured", "learned", "unverified")
+        },
+    )
+    states = {
+        ("likely", "measured"): PairState(num_inliers=30),
+        ("learned", "likely"): PairState(num_inliers=30, level=1),
+        ("likely", "unverified"): PairState(num_inliers=0),
+        ("likely", "in no model"): PairState(num_inliers=30),
+    }
+    assert state._anchored(model, states) == {"likely", "measured"}
+
+
+@pytest.mark.parametrize(
+    ("size", "megapixels"),
+    [((4000, 3000), 0.75), ((3000, 4000), 0.75), ((800, 600), 0.48)],
+)
+def test_photographs_count_as_large_as_they_are_shrunk_to(
+    size: tuple[int, int], megapixels: float
+) -> None:
+    assert _megapixels(size, 1000) == pytest.approx(megapixels)

@@ -96,14 +96,22 @@ def share(path: Path, left_of: float, *, repeats: bool = False) -> float:
     return share_of_motion(model, PairGraph.read(path))
 
 
+def left_part_of_wall(part: float) -> float:
+    """Return up to where so large a part of the points of the wall is."""
+    return float(np.quantile(wall(np.random.default_rng(2), NUM_POINTS)[:, 0], part))
+
+
 def middle_of_wall() -> float:
-    return float(np.median(wall(np.random.default_rng(2), NUM_POINTS)[:, 0]))
+    return left_part_of_wall(0.5)
 
 
-def test_of_a_wall_whose_half_moves_half_moves_as_the_model_says(
-    tmp_path: Path,
+@pytest.mark.parametrize("part", [0.25, 0.5])
+def test_of_a_wall_of_which_a_part_moves_the_rest_moves_as_the_model_says(
+    tmp_path: Path, part: float
 ) -> None:
-    assert share(tmp_path / "half.db", middle_of_wall()) == pytest.approx(0.5, abs=0.15)
+    path = tmp_path / "moving.db"
+    found = share(path, left_part_of_wall(part))
+    assert found == pytest.approx(1.0 - part, abs=0.15)
 
 
 def test_where_nothing_moves_all_moves_as_the_model_says(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from colmap_affrect.mappers.pair_graph import (
     VerifiedPair,
     _strongest,
     cameras_of,
+    compared_with_pose,
     poses_of,
 )
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
@@ -183,6 +184,25 @@ def test_matches_agree_that_are_a_few_pixels_off_their_epipolar_lines(
     graph = PairGraph.read(tmp_path / "database.db")
     assert lowest_agreement(shifted(graph, 3.0), model) > 0.9
     assert lowest_agreement(shifted(graph, 60.0), model) < 0.3
+
+
+def test_a_pose_explains_matches_of_cameras_with_other_focal_lengths() -> None:
+    wide = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
+    narrow = pycolmap.Camera.create_from_model_name(
+        2, "SIMPLE_PINHOLE", 1500.0, 640, 480
+    )
+    points = np.random.default_rng(2).uniform((-1, -1, 9), (1, 1, 12), (50, 3))
+    rotation = pycolmap.Rotation3d(np.array([0.03, -0.05, 0.1])).matrix()
+    translation = np.array([0.8, 0.3, 0.1])
+    there = points @ rotation.T + translation
+    seen = wide.img_from_cam(points), narrow.img_from_cam(there)
+    pose = rotation, translation / np.linalg.norm(translation)
+    found = compared_with_pose(pose, (wide, narrow), seen)
+    assert found.errors_px.max() < 1e-6
+    assert found.agrees.all()
+    length = np.linalg.norm(translation)
+    np.testing.assert_allclose(found.depths.first, points[:, 2] / length)
+    np.testing.assert_allclose(found.depths.second, there[:, 2] / length)
 
 
 def test_in_large_images_matches_may_be_farther_off(tmp_path: Path) -> None:
