@@ -7,7 +7,13 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.escalation.expected_gain import (
+    Candidate,
+    LevelStatistics,
+    PairState,
+    StepPlanner,
+    _Selection,
+)
 from colmap_affrect.escalation.set_state import SetState, _megapixels
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, ModelSummary
@@ -85,3 +91,26 @@ def test_photographs_count_as_large_as_they_are_shrunk_to(
     size: tuple[int, int], megapixels: float
 ) -> None:
     assert _megapixels(size, 1000) == pytest.approx(megapixels)
+
+
+def test_features_that_several_pairs_need_are_paid_once() -> None:
+    megapixels = {"a": 1.0, "b": 2.0, "c": 3.0}
+    planner: Any = SimpleNamespace(megapixels=megapixels, lacking={"a", "b", "c"})
+    statistics = LevelStatistics(coefficients={}, image_s=10.0, pair_s=1.0)
+    selection = _Selection(planner, statistics, seconds=0.0)
+    first = Candidate(("a", "b"), 0.5, ())
+    second = Candidate(("b", "c"), 0.5, ())
+    assert selection.seconds_of(first) == 10.0 * (1.0 + 2.0) + 2.0
+    selection.add(first)
+    assert selection.seconds_of(second) == 10.0 * 3.0 + 3.0
+
+
+def test_a_level_wins_pairs_that_it_verifies_and_loses_those_it_was_tried_for() -> None:
+    states = {
+        ("a", "b"): PairState(num_inliers=20, level=1, tried=0b11),
+        ("a", "c"): PairState(num_inliers=0, level=1, tried=0b11),
+        ("b", "c"): PairState(num_inliers=20, level=0, tried=0b11),
+        ("b", "d"): PairState(num_inliers=20, level=0, tried=0b01),
+    }
+    planner = StepPlanner(states, set(), {}, {}, (), (), (), 100)
+    assert planner._wins_and_losses(1) == (1, 2)
