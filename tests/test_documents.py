@@ -107,7 +107,8 @@ def test_commands_in_the_text_exist(name: str) -> None:
 def test_flags_in_the_text_exist(name: str) -> None:
     for code in inline(name):
         is_of_script = "recipes/" in code or "tests/" in code
-        flags = {flag.partition("=")[0] for flag in re.findall(r"--[a-zA-Z]\S*", code)}
+        words = re.findall(r"(?<!\S)--[a-zA-Z]\S*", code)
+        flags = {word.partition("=")[0] for word in words}
         assert is_of_script or flags <= {*ALL_FLAGS, *FOREIGN}, code
 
 
