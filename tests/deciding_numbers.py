@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 DRAWN = "colmap_affrect/report/"
-MAX_JUDGED = 120  # numbers that nothing but results on photographs speaks for
+MAX_JUDGED = 119  # numbers that nothing but results on photographs speaks for
 JUDGED = "judged"
 SOURCES = {
     JUDGED: "chosen by results on photographs whose poses are known, or by eye",

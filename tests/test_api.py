@@ -323,9 +323,7 @@ def report_of(folder: Path, **changes: Any) -> RunReport:
     return RunReport(**values)
 
 
-def test_a_notebook_shows_counts_photographs_and_what_to_try(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_notebook_shows_counts_photographs_and_what_to_try(tmp_path: Path) -> None:
     report = report_of(tmp_path)
     page = report._repr_html_()
     assert NAMES[0] not in page, "names are no markup"
@@ -345,6 +343,12 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(
     assert pairs["e.png"] == "no verified pair"
     assert pairs["Try: one camera"].startswith("colmap-affrect run")
     assert text[-1] == str(tmp_path / "out")
+
+
+def test_a_notebook_links_a_page_below_its_folder_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = report_of(tmp_path)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "report.html").touch()
     assert report.page_path == tmp_path / "out" / "report.html"

@@ -96,31 +96,40 @@ def test_stages_come_after_those_that_they_need(name: str) -> None:
 
 
 @each_page
-def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
+def test_commands_in_the_text_exist(name: str) -> None:
     for code in inline(name):
         words = code.split()
         if words[0] == "colmap-affrect" and len(words) > 1 and words[1].islower():
             assert words[1] in COMMANDS, code
-        for flag in (
-            word.partition("=")[0] for word in words if re.match(r"--[a-zA-Z]", word)
-        ):
-            script = "recipes/" in code or "tests/" in code
-            assert script or flag in {*ALL_FLAGS, *FOREIGN}, code
+
+
+@each_page
+def test_flags_in_the_text_exist(name: str) -> None:
+    for code in inline(name):
+        is_of_script = "recipes/" in code or "tests/" in code
+        words = re.findall(r"(?<!\S)--[a-zA-Z]\S*", code)
+        flags = {word.partition("=")[0] for word in words}
+        assert is_of_script or flags <= {*ALL_FLAGS, *FOREIGN}, code
+
+
+@each_page
+def test_names_of_the_package_in_the_text_exist(name: str) -> None:
+    for code in inline(name):
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
             found = pkgutil.resolve_name(code)
             is_public = code.split(".")[1] in colmap_affrect.__all__
-            assert is_public or inspect.ismodule(found), (
-                f"{code}: import colmap_affrect has none"
-            )
-        if (
-            words[0] == "--recipe"
-            and words[1:]
-            and not words[1].isupper()
-            and ".toml" not in code
-        ):
-            load_recipe(words[1])
-        if words[0] == "--set" and "=" in code:
-            load_recipe("default", [words[1]])
+            assert is_public or inspect.ismodule(found), f"{code} is not public"
+
+
+@each_page
+def test_recipes_and_settings_in_the_text_exist(name: str) -> None:
+    for code in inline(name):
+        recipe = re.match(r"--recipe ([a-z][\w-]*)(?=\s|$)", code)
+        if recipe:
+            load_recipe(recipe[1])
+        setting = re.match(r"--set (\S+=\S*)", code)
+        if setting:
+            load_recipe("default", [setting[1]])
 
 
 @each_page

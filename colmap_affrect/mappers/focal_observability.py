@@ -25,7 +25,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 FACTORS = 1.25, 0.8
 """Other focal lengths that are tried: with these, poses are off by 5 degrees and more (judged)."""
 MIN_GROWTH = 0.003  # of the cost with another focal length: less is nothing (judged)
-MAX_GROWTH = 1.0  # as of known focal lengths: more makes no photograph surer (judged)
+MAX_GROWTH = 1.0  # that of a known focal length: more makes none surer; theory
 # Of the logarithm of a given focal length while others are tried: nearly free; theory
 FREE_SIGMA = 1.0
 # Of the logarithm of a given focal length, from which on another one is named; display

@@ -1,39 +1,103 @@
 """Which judged numbers the tests pin: each is made ten times larger, and ten times smaller.
 
     python tests/benchmarks/mutations.py --folders geometry images --output-path mutations.json
+    python tests/benchmarks/mutations.py --changes changes.json --output-path mutations.json
 
 For every judged number (tests/deciding_numbers.py) the package is copied with that one number
-changed, and the tests that concern it run: first those that import its module, then, with
-`--wide`, all others of its folder. A number *survives* where none of them fails. What was tried is
-written after each number, and is not tried again when the command is repeated.
+changed, and the tests that concern it run: the files that name most of its module, or, with
+`--wide`, all that import it and all others of its folder. A number *survives* where none of them
+fails. What was tried is written after each number, and is not tried again when the command is
+repeated.
+
+With `--changes` other changes are tried in their place, those of a file: a JSON list of objects
+with `module`, `before` and `after`, a text that the module has once, and what it becomes.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
+import compileall
+import importlib
 import json
 import os
+import py_compile
+import re
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn, Protocol
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import pytest
 from deciding_numbers import JUDGED, PACKAGE, ROOT, Number, all_numbers
-from machine import parser_of
 
 FACTORS = {"ten times larger": 10.0, "ten times smaller": 0.1}
 COPIED = ("colmap_affrect", "tests", "sample_scenes", "docs", "recipes")
 MAX_SECONDS = 240.0  # of the tests of one number; what takes longer is undecided
+MAX_FILES = 4  # of tests of one number, but with `--wide`
 OUTCOMES = {0: "survives", 5: "has no tests"}  # by pytest's exit code; others: caught
+LIBRARIES = ("cv2", "h5py", "hypothesis", "networkx", "numpy", "pyceres", "pycolmap")
+"""What most tests load: it is loaded once, and the tests run in copies of this process."""
+# By content: a changed module may be as long and as old as it was
+CHECKED_HASH = py_compile.PycInvalidationMode.CHECKED_HASH
+
+
+class Mutation(Protocol):
+    """A change of one module."""
+
+    @property
+    def module(self) -> Path:
+        """The file, relative to the project."""
+
+    @property
+    def name(self) -> str:
+        """For people, and as a key."""
+
+    def text(self) -> str:
+        """Return the changed text of the module."""
 
 
 @dataclass(frozen=True)
-class Mutation:
+class Replacement:
+    """A text of a module that becomes another one.
+
+    Attributes:
+        file: of the module, relative to the package.
+        before: what the module has once.
+        after: what takes its place.
+    """
+
+    file: str
+    before: str
+    after: str
+
+    @property
+    def module(self) -> Path:
+        """The file, relative to the project."""
+        return Path(PACKAGE.name) / self.file
+
+    @property
+    def name(self) -> str:
+        """For people, and as a key."""
+        return f"{self.file}: {self.before} -> {self.after}"
+
+    def text(self) -> str:
+        """Return the changed text of the module."""
+        text = (ROOT / self.module).read_text(encoding="utf-8")
+        if text.count(self.before) != 1:
+            raise ValueError(f"{self.file} must have this once: {self.before}")
+        return text.replace(self.before, self.after)
+
+
+@dataclass(frozen=True)
+class WrongNumber:
     """A judged number that is ten times off.
 
     Attributes:
@@ -107,21 +171,35 @@ def tests_of(module: Path, is_wide: bool) -> list[str]:
     dotted = ".".join(module.with_suffix("").parts)
     parent, _, name = dotted.rpartition(".")
     folder = ROOT / "tests" / module.parent.relative_to(PACKAGE.name)
-    named = folder / f"test_{module.stem}.py"
-    importing = list[Path]()
+    defined = names_defined_in(ROOT / module)
+    importing = dict[Path, int]()  # how many of the module's names each file has
     others = list[Path]()
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         text = path.read_text(encoding="utf-8")
-        if path == named:
-            importing.insert(0, path)
+        if path == folder / f"test_{module.stem}.py":
+            importing[path] = len(defined) + 1
         elif dotted in text or f"from {parent} import {name}" in text:
-            importing.append(path)
+            importing[path] = len(defined.intersection(re.findall(r"\w+", text)))
         elif path.parent == folder:
             others.append(path)
-    found = importing
+    found = sorted(importing, key=lambda path: -importing[path])
     if is_wide or not importing:
-        found = importing + others
-    return [str(path.relative_to(ROOT)) for path in found] + [str(module)]
+        found += others
+    else:
+        found = found[:MAX_FILES]
+    return [str(module)] + [str(path.relative_to(ROOT)) for path in found]
+
+
+def names_defined_in(path: Path) -> set[str]:
+    """Return the names of the functions, classes and constants of a module."""
+    names = set[str]()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                names.add(name)
+            case ast.Assign(targets=[ast.Name(id=name)]):
+                names.add(name)
+    return names
 
 
 def outcome_of(mutation: Mutation, copy: Path, is_wide: bool) -> str:
@@ -129,28 +207,56 @@ def outcome_of(mutation: Mutation, copy: Path, is_wide: bool) -> str:
     path = copy / mutation.module
     original = path.read_text(encoding="utf-8")
     path.write_text(mutation.text(), encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-x"]
-    command += ["-p", "no:cacheprovider", *tests_of(mutation.module, is_wide)]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(copy),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
     try:
-        done = subprocess.run(
-            command,
-            cwd=copy,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=MAX_SECONDS,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return "undecided: the tests take too long"
+        return outcome_of_tests(tests_of(mutation.module, is_wide), copy)
     finally:
         path.write_text(original, encoding="utf-8")
-    return OUTCOMES.get(done.returncode, f"caught: {first_failure(done.stdout)}")
+
+
+def outcome_of_tests(tests: Iterable[str], copy: Path) -> str:
+    """Run tests of a copy of the project, and return what came of that."""
+    with tempfile.TemporaryFile("w+") as output:
+        process = os.fork()
+        if not process:
+            run_tests(tests, copy, output.fileno())
+        code = exit_code(process)
+        if code is None:
+            return "undecided: the tests take too long"
+        output.seek(0)
+        return OUTCOMES.get(code, f"caught: {first_failure(output.read())}")
+
+
+def run_tests(tests: Iterable[str], copy: Path, output: int) -> NoReturn:
+    """Run tests of a copy of the project in this process, and end it."""
+    code = 3
+    try:
+        os.setsid()
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        os.chdir(copy)
+        os.environ["PYTHONPATH"] = str(copy)
+        ours = (str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent))
+        sys.path[:] = [str(copy), *[path for path in sys.path if path not in ours]]
+        del sys.modules["deciding_numbers"]
+        arguments = ["-n", "0", "-q", "-x", "-p", "no:cacheprovider"]
+        arguments += ["-W", "ignore::pytest.PytestAssertRewriteWarning", *tests]
+        code = int(pytest.main(arguments))
+        sys.stdout.flush()
+    finally:
+        os._exit(code)
+
+
+def exit_code(process: int) -> int | None:
+    """Wait for a process, which is ended where it takes too long: None then."""
+    end = time.monotonic() + MAX_SECONDS
+    while time.monotonic() < end:
+        found, status = os.waitpid(process, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.05)
+    os.killpg(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    return None
 
 
 def first_failure(output: str) -> str:
@@ -161,34 +267,55 @@ def first_failure(output: str) -> str:
     return "pytest ended otherwise"
 
 
-def mutations(folders: list[str]) -> Iterator[Mutation]:
+def mutations(folders: list[str]) -> Iterator[WrongNumber]:
     """Yield both mutations of each judged number, of some folders or all."""
     for number in all_numbers():
         folder = Path(number.where).parts[1]
         if number.source == JUDGED and (not folders or folder in folders):
             for change in FACTORS:
-                yield Mutation(number, change)
+                yield WrongNumber(number, change)
+
+
+def replacements(path: Path) -> Iterator[Replacement]:
+    """Yield the changes of a file."""
+    for row in json.loads(path.read_text(encoding="utf-8")):
+        yield Replacement(row["module"], row["before"], row["after"])
 
 
 def main() -> None:
-    """Try the numbers that have not been tried, and print what survives."""
-    parser = parser_of(__doc__)
+    """Try what has not been tried, and print what survives."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--folders", nargs="*", default=[], help="default: all")
     parser.add_argument(
         "--names", nargs="*", default=[], help="of numbers; default: all"
     )
+    parser.add_argument("--changes", type=Path, help="others, in a JSON file")
     parser.add_argument("--wide", action="store_true", help="with tests of the folder")
     parser.add_argument("--output-path", type=Path, default=Path("mutations.json"))
     given = parser.parse_args()
+    asked = list[Mutation]()
+    if given.changes:
+        asked += replacements(given.changes)
+    else:
+        for mutation in mutations(given.folders):
+            if not given.names or mutation.number.name in given.names:
+                asked.append(mutation)
     known = dict[str, str]()
     if given.output_path.exists():
         known = json.loads(given.output_path.read_text(encoding="utf-8"))
+    for library in LIBRARIES:
+        importlib.import_module(library)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         shutil.copytree(ROOT, copy, dirs_exist_ok=True, ignore=not_copied)
-        for mutation in mutations(given.folders):
-            is_asked = not given.names or mutation.number.name in given.names
-            if mutation.name in known or not is_asked:
+        compileall.compile_dir(
+            copy / PACKAGE.name, quiet=1, invalidation_mode=CHECKED_HASH
+        )
+        unchanged = outcome_of_tests(["tests/test_deciding_numbers.py"], copy)
+        if unchanged != OUTCOMES[0]:
+            raise RuntimeError(f"without any change {unchanged}")
+        for mutation in asked:
+            if mutation.name in known:
                 continue
             known[mutation.name] = outcome_of(mutation, copy, given.wide)
             print(f"{mutation.name}: {known[mutation.name]}", flush=True)

@@ -287,7 +287,7 @@ def test_keypoints_of_smaller_pictures_are_found(
     "INSERT INTO descriptors VALUES (2, 0, 7, 128, zeroblob(896))",
     "INSERT INTO frames VALUES (9, 1)",  # which holds nothing
     "INSERT INTO rig_sensors VALUES (1, 1, 1, zeroblob(56))",  # an IMU, and it is known where
-    changed_keypoint(6, 0, 91.0),  # a little beyond the border
+    changed_keypoint(6, 0, 92.5),  # 2 px and a hundredth of a side beyond the border
     changed_keypoint(6, 0, 1.0),
     at_one_place(11, 9),
     replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),

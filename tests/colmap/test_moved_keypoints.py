@@ -39,13 +39,13 @@ def write_database(path: Path, *, fisheye: bool = False) -> Path:
     return path
 
 
-def change_keypoints(path: Path, change: Change) -> str:
+def change_keypoints(path: Path, change: Change, image_id: int = CHANGED) -> str:
     """Change the keypoints of one image; return its name."""
     with open_database(path) as database:
-        keypoints = np.array(database.read_keypoints(CHANGED))
+        keypoints = np.array(database.read_keypoints(image_id))
         keypoints[:, :2] = change(keypoints[:, :2])
-        database.update_keypoints(CHANGED, keypoints)
-        return str(database.read_image(CHANGED).name)
+        database.update_keypoints(image_id, keypoints)
+        return str(database.read_image(image_id).name)
 
 
 def mirrored(points: Floats) -> Floats:
@@ -74,6 +74,14 @@ def test_image_with_changed_keypoints_is_named_and_its_partners_are_not(
     path = write_database(tmp_path / "any.db", fisheye=fisheye)
     name = change_keypoints(path, change)
     assert check_database(path)[1] == {"keypoints-moved": [name]}
+
+
+def test_partners_of_two_images_with_changed_keypoints_are_not_named(
+    tmp_path: Path,
+) -> None:
+    path = write_database(tmp_path / "any.db")
+    names = [change_keypoints(path, mirrored, image_id) for image_id in (2, CHANGED)]
+    assert check_database(path)[1] == {"keypoints-moved": sorted(names)}
 
 
 @pytest.mark.parametrize("fisheye", [False, True])

@@ -25,6 +25,7 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.geometry.affine import project, rotation, transform_lafs
+from colmap_affrect.geometry.parallax import text_line_matches
 
 Array = NDArray[np.float64]
 Frames = tuple[Array, Array]
@@ -302,6 +303,25 @@ def test_writing_at_another_place_ties_no_pair_and_leaves_none() -> None:
             (sides[0], sides[1]), matches, VerificationOptions(min_significance=0.0)
         )
         assert len(accepted.inlier_matches) >= 40
+
+
+def test_a_tenth_of_the_matches_on_a_ledge_are_no_writing() -> None:
+    plane = np.array([[0.9, 0.0, 40.0], [0.02, 0.95, 20.0], [4e-4, 3e-4, 1.0]])
+    scene = frames_of([plane], 80, 1)
+    ledge, _ = frames_of([np.eye(3)], 12, 11)
+    ledge[:, 0, 2] = np.linspace(300.0, 400.0, 12)
+    ledge[:, 1, 2] = 250.0
+    lafs1 = np.concatenate([scene[0], ledge])
+    lafs2 = np.concatenate([scene[1], transform_lafs(plane, ledge)])
+    sizes = ((640, 480), (640, 480))
+    written = text_line_matches(lafs1[:, :, 2], lafs2[:, :, 2], sizes)
+    assert written[80:].all()
+    assert written.mean() < 0.15
+    sides = sides_of((lafs1, lafs2))
+    found = estimate_geometry(
+        (sides[0], sides[1]), row_by_row(92), VerificationOptions()
+    )
+    assert len(found.inlier_matches) == 92
 
 
 def search_for(

@@ -184,23 +184,31 @@ def test_table_has_the_best_method_first_and_ranges_over_the_seeds():
     }
 
 
-def test_json_and_summary_say_the_same():
-    compared = comparison(
-        SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED
-    )
+@pytest.fixture
+def compared() -> Comparison:
+    return comparison(SIFT, method("default", "abcd", "abcde", correct="abc"), FAILED)
+
+
+def test_json_has_the_verdict_and_its_ending(compared: Comparison) -> None:
     values = json.loads(to_json(compared))
     ending = conclusion(compared)
     assert ending
     assert values["conclusion"] == ending
     assert values["verdict"] == [*headline(compared), *notes(compared), ending]
     assert (values["images_total"], values["registered_by_none"]) == (6, ["e", "f"])
-    default = values["methods"]["default"]
+
+
+def test_json_has_each_method_as_a_whole_and_by_seed(compared: Comparison) -> None:
+    default = json.loads(to_json(compared))["methods"]["default"]
     assert default["registered"] == {"mean": 4.5, "min": 4.0, "max": 5.0}
     assert default["registered_names"] == {"0": [*"abcd"], "1": [*"abcde"]}
     assert (default["wall_s"]["map"], default["total_s"]) == (4.0, 11.0)
     seed = default["seeds"][0]
     assert (seed["registered"], seed["correct"], seed["points3D"]) == (4, 3, 900)
     assert seed["scores"]["correct_names"] == [*"abc"]
+
+
+def test_summary_has_a_row_for_each_method(compared: Comparison) -> None:
     found, _, text = summary(compared).partition("\n\n")
     rows = [line.split() for line in found.splitlines()]
     assert [row[0] for row in rows] == ["method", "default", "sift", "sift"]

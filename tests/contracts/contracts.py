@@ -227,7 +227,19 @@ class RectifierContract(Contract):
 
 
 def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
+    """The numbers of a warp are possible, and it takes its region onto its canvas."""
+    check_numbers(item)
     width, height = size
+    region = np.ones((height, width), bool) if item.region is None else item.region
+    points = np.argwhere(region)[:, ::-1] + np.array(item.region_origin, dtype=float)
+    assert len(points)
+    assert (points >= 0).all()
+    assert (points <= np.array([width - 1, height - 1])).all()
+    check_mapping(item, points)
+    check_direction(item, points.mean(axis=0))
+
+
+def check_numbers(item: Rectification) -> None:
     matrix = item.rectified_from_image
     assert matrix.shape == (3, 3)
     assert np.isfinite(matrix).all()
@@ -235,20 +247,18 @@ def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
     assert min(item.canvas_size) >= 1
     assert item.tilt >= 1.0
     assert 0.0 <= item.tilt_angle_rad < np.pi
-    region = np.ones((height, width), bool) if item.region is None else item.region
-    points = np.argwhere(region)[:, ::-1] + np.array(item.region_origin, dtype=float)
-    assert len(points)
-    assert (points >= 0).all()
-    assert (points <= np.array([width - 1, height - 1])).all()
+
+
+def check_mapping(item: Rectification, points: np.ndarray) -> None:
+    """A warp takes points onto its canvas, none through the horizon, and mirrors none."""
+    matrix = item.rectified_from_image
     assert (points @ matrix[2, :2] + matrix[2, 2] > 0).all()
     mapped = project(matrix, points)
     assert (mapped >= -ROUNDING_PX).all()
     assert (mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX).all()
-    frames = np.concatenate(
-        [np.tile(np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2
-    )
+    shapes = np.tile(np.eye(2), (len(points), 1, 1))
+    frames = np.concatenate([shapes, points[:, :, None]], axis=2)
     assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
-    check_direction(item, points.mean(axis=0))
 
 
 def check_direction(item: Rectification, middle: np.ndarray) -> None:

@@ -34,6 +34,7 @@ from colmap_affrect.escalation.alternatives import (
 )
 from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
 from colmap_affrect.escalation.set_state import SetState
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.match_state import Begun, LearnedModels
@@ -161,6 +162,14 @@ def without_matches(escalation: Escalation, pair: tuple[str, str]) -> None:
     escalation.write()
 
 
+def stored_matches(context: Context, pair: tuple[str, str]) -> Indices:
+    """Return the (M, 2) raw matches of a pair in the database."""
+    ids = image_ids(context.workspace.database)
+    first, second = pair
+    with open_database(context.workspace.database) as database:
+        return database.read_matches(ids[first], ids[second])
+
+
 def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     context: Context, mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,11 +199,8 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert context.matches.state.follows == ""
     assert context.workspace.model_inputs() == context.current_model_inputs()
     assert levels(context) == {1}
-    ids = image_ids(context.workspace.database)
-    with open_database(context.workspace.database) as database:
-        for pair, kept in learned.items():
-            stored = database.read_matches(*(ids[name] for name in pair))
-            assert_array_equal(stored, kept.matches.indices)
+    for pair, kept in learned.items():
+        assert_array_equal(stored_matches(context, pair), kept.matches.indices)
     for pair, state in escalation.state.states().items():
         assert state.measured_worth == before[pair].worth
     assert not choose_learned(escalation, at_once=False)  # that is decided
@@ -287,6 +293,23 @@ def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
     return escalation
 
 
+def assert_same_with_all_keypoints(
+    workspace: Workspace, old: pycolmap.Reconstruction
+) -> None:
+    """The largest model has the points that it had, and the keypoints of the database."""
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    assert model.num_points3D() == old.num_points3D()
+    for image in model.images.values():
+        with open_database(workspace.database) as database:
+            keypoints = database.read_keypoints(image.image_id)
+        assert_array_equal([point.xy for point in image.points2D], keypoints[:, :2])
+        was = old.images[image.image_id]
+        ids = [point.point3D_id for point in image.points2D]
+        ids_before = [point.point3D_id for point in was.points2D]
+        assert ids[: len(ids_before)] == ids_before
+        assert image.num_points3D == was.num_points3D
+
+
 def test_best_models_and_their_matches_come_back(
     mapped: Workspace, mapper: Mapper, tmp_path: Path
 ) -> None:
@@ -304,19 +327,7 @@ def test_best_models_and_their_matches_come_back(
     for table in before.keys() - {"keypoints"}:
         assert after[table] == before[table]
     assert levels(context) == {0}
-    model = pycolmap.Reconstruction(workspace.sparse / "0")
-    with open_database(workspace.database) as database:
-        for image in model.images.values():
-            keypoints = database.read_keypoints(image.image_id)
-            assert image.num_points2D() == len(keypoints)
-            assert_array_equal([point.xy for point in image.points2D], keypoints[:, :2])
-            was = old.images[image.image_id]
-            ids = [point.point3D_id for point in image.points2D]
-            assert ids[: was.num_points2D()] == [
-                point.point3D_id for point in was.points2D
-            ]
-            assert image.num_points3D == was.num_points3D
-    assert model.num_points3D() == old.num_points3D()
+    assert_same_with_all_keypoints(workspace, old)
     tried = context.matches.levels(escalation.state.pairs, "tried")
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
     assert (

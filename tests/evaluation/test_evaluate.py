@@ -95,6 +95,11 @@ def test_every_recipe_solves_easy_pairs(done: Done) -> None:
         assert max(errors(recipe)) < 1.0
         assert recipe.summary["homographies"]["< 1 px"] == 3
         assert (recipe.costs["solved"], recipe.costs["failed"]) == (1.0, 0)
+
+
+def test_each_pair_has_its_counts_and_seconds(done: Done) -> None:
+    _, evaluation = done
+    for recipe in evaluation.recipes:
         assert recipe.costs["seconds"] == sum(pair.seconds for pair in recipe.pairs)
         for pair in recipe.pairs:
             assert 4 <= pair.num_inliers <= pair.num_matches <= min(pair.num_keypoints)

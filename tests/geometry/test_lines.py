@@ -73,6 +73,29 @@ def test_a_line_in_pieces_counts_as_one_and_parallel_lines_count_each() -> None:
     assert by_length[round(500 / 1500, 4)] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("angle", "is_same_line"), [(0.02, True), (0.2, False)])
+def test_pieces_of_a_line_have_its_direction_but_for_three_degrees(
+    angle: float, *, is_same_line: bool
+) -> None:
+    across = 30.0 * np.cos(angle)
+    down = 30.0 * np.sin(angle)
+    long = [100.0, 500.0, 900.0, 500.0]
+    short = [500.0 - across, 500.0 - down, 500.0 + across, 500.0 + down]
+    segments = Segments.of_image(np.array([long, short]), SIZE)
+    alone = [800.0 / 860.0, 60.0 / 860.0] if is_same_line else [1.0, 1.0]
+    assert_allclose(segments.weights, alone, rtol=1e-6)
+
+
+def test_four_segments_by_chance_are_reckoned_with_beforehand() -> None:
+    building = Building(focal=1.3, noise_px=0.0)
+    segments = Segments.of_image(building.edges(), SIZE)
+    truth = building.rotation.T
+    fit = VanishingFit(segments, truth[None], np.array([1.3]), np.zeros(1))
+    num_beforehand = 3.0 + 4.0
+    expected = 4.0 / (num_beforehand + segments.weights.sum())
+    assert fit.shares[0, 3] == pytest.approx(expected, rel=0.4)
+
+
 def test_directions_of_short_segments_are_less_sure() -> None:
     segments = Segments.of_image(
         np.array([[0.0, 0.0, 750.0, 0.0], [0.0, 0.0, 15.0, 0.0]]), SIZE

@@ -12,7 +12,7 @@ from exported_model import write_model
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.interop.align import Reference, align
+from colmap_affrect.interop.align import Reference, _not_fitting, align
 from colmap_affrect.interop.consensus import agreeing
 
 ORIGIN = (49.5, 15.25, 300.0)
@@ -171,6 +171,33 @@ def test_positions_that_are_wrong_are_left_out_and_named(
     assert left_out == wrong.keys()
     new = centers(pycolmap.Reconstruction(tmp_path / "new"))
     assert max(np.linalg.norm(center) for center in new.values()) < 300
+
+
+PLACES = np.array(
+    [[11.0, 7, 5], [19, 7, 6], [19, 13, 5], [11, 12, 7], [14, 9, 9], [17, 11, 8]]
+)
+"""Of photographs in a model; the first four are within 8 of each other."""
+
+
+@pytest.mark.parametrize(("distance", "agrees"), [(30.0, True), (300.0, False)])
+def test_of_four_places_one_is_wrong_that_is_ten_times_as_far_as_the_others_spread(
+    distance: float, *, agrees: bool
+) -> None:
+    four = PLACES[:4]
+    moved = four.copy()
+    moved[2] += [0.0, distance, 0.0]
+    assert agreeing(four, moved, 0.0).tolist() == [True, True, agrees, True]
+
+
+@pytest.mark.parametrize(("distance", "is_wrong"), [(0.05, False), (0.5, True)])
+def test_a_position_of_a_table_may_be_off_by_a_fiftieth_of_how_far_all_spread(
+    distance: float, *, is_wrong: bool
+) -> None:
+    names = "abcdef"
+    old = dict(zip(names, PLACES, strict=True))
+    true = {**old, "c": old["c"] + [0.0, 0.0, distance]}
+    left_out = _not_fitting(old, true, is_on_earth=False)
+    assert set(left_out) == ({"c"} if is_wrong else set())
 
 
 @pytest.mark.long

@@ -30,6 +30,18 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> pycolmap.Reconstruction:
     return synthesize(path, num_rigs=4, num_points3D=150, noise_px=0.5)
 
 
+@pytest.mark.parametrize(("num_points", "min_track_length"), [(60, 2), (200, 3)])
+def test_tracks_of_two_are_left_out_where_all_images_see_a_hundred_longer_ones(
+    tmp_path: Path, num_points: int, min_track_length: int
+) -> None:
+    seen_by_all = synthesize(
+        tmp_path / "database.db", num_rigs=4, num_points3D=num_points
+    )
+    priors = dict.fromkeys(seen_by_all.cameras, CameraPrior(TRUE_FOCAL, 0.1))
+    adjuster = Adjuster(priors, 0.5, pycolmap.BundleAdjustmentOptions())
+    assert adjuster._options(seen_by_all, ()).min_track_length == min_track_length
+
+
 def mean_distortion(model: pycolmap.Reconstruction, noise_px: float) -> float:
     """Adjust a copy of a model, with known focal lengths, to keypoints of some noise."""
     trial = pycolmap.Reconstruction(model)
@@ -100,6 +112,17 @@ def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
             assert jacobian.reshape(4, 4)[:, index] == pytest.approx(
                 slopes, rel=1e-4, abs=1e-6
             )
+
+
+def test_a_distortion_of_a_seventh_costs_as_much_as_two_deviations() -> None:
+    distorted = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE
+    )
+    distorted.params = [TRUE_FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.14]
+    cost = IntrinsicsCost(distorted, CameraPrior(TRUE_FOCAL, 0.3), 0.5, constant=[])
+    residuals = np.zeros(4)
+    assert cost.Evaluate([distorted.params], residuals, None)
+    assert residuals == pytest.approx([0.0, 0.0, 0.0, 2.0 * 0.5])
 
 
 def test_focal_lengths_without_information_go_to_their_prior_also_from_far_away(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,40 @@ def test_depths_far_from_the_features_of_a_pair_tell_no_scale(
     assert far.num_points3D() > 20
     assert 4 in bridged(grower, near)
     assert 4 not in bridged(grower, far)
+
+
+@pytest.mark.parametrize(("hole_px", "is_told"), [(50.0, True), (160.0, False)])
+def test_a_plane_around_features_tells_their_scale_up_to_an_eighth_of_the_image(
+    hole_px: float, *, is_told: bool
+) -> None:
+    """Depths are known on a slanted wall, but for a hole in which the features of the pair are."""
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 900.0, 1000, 700)
+    middle = np.array([600.0, 300.0])
+    x, y = np.meshgrid(np.arange(300.0, 900.0, 15.0), np.arange(0.0, 600.0, 15.0))
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    known = grid[np.linalg.norm(grid - middle, axis=1) > hole_px]
+    features = middle + np.random.default_rng(1).uniform(-10.0, 10.0, (30, 2))
+    posed: Any = SimpleNamespace(
+        cameras={8: camera}, known_depths=lambda _: (known, depths_of_wall(known))
+    )
+    keypoints = np.concatenate([np.zeros((5, 2)), features]).astype(np.float32)
+    graph: Any = SimpleNamespace(keypoints={8: keypoints})
+    open_pair: Any = SimpleNamespace(inside=8, side=1)
+    rows = np.arange(30)
+    relative: Any = SimpleNamespace(
+        matches=np.stack([rows, rows + 5], axis=1),
+        depths=(np.ones(30), depths_of_wall(features) / 2.5),
+    )
+    adjuster: Any = None
+    scale = BridgeFinder(graph, adjuster, SEED)._scale(posed, open_pair, relative)
+    assert (scale is not None) == is_told
+    if scale:
+        assert scale.scale == pytest.approx(2.5, rel=1e-3)
+
+
+def depths_of_wall(points_px: np.ndarray) -> np.ndarray:
+    """Return the depths of a slanted wall at (N, 2) px."""
+    return 1.0 / (0.1 + points_px @ [1e-4, 5e-5])
 
 
 def test_few_depths_tell_no_scale(

@@ -95,6 +95,11 @@ def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> 
     assert camera_prior(camera(), given, said) == CameraPrior(1200.0, 0.0)
 
 
+def test_lines_of_many_images_leave_a_tenth_of_a_focal_length_open() -> None:
+    sharp = [by_lines(0.9, 0.06)] * 20
+    assert camera_prior(camera(), NOTHING, sharp).sigma == pytest.approx(0.1)
+
+
 def test_the_prior_of_a_camera_of_many_images_is_made_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

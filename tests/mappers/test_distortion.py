@@ -27,16 +27,19 @@ PARAMS = [1280.0, 512.0, 384.0, 0.0]
 TRAP = -0.5  # a wrong distortion
 
 
-@pytest.mark.parametrize(("num_images", "is_told"), [(4, True), (2, False)])
+@pytest.mark.parametrize(
+    ("num_images", "num_points", "is_told"),
+    [(4, 200, True), (3, 30, True), (2, 200, False)],
+)
 def test_several_images_of_a_camera_tell_its_distortion_and_two_do_not(
-    tmp_path: Path, num_images: int, *, is_told: bool
+    tmp_path: Path, num_images: int, num_points: int, *, is_told: bool
 ) -> None:
     path = tmp_path / "database.db"
     synthesize(
         path,
         num_rigs=1,
         num_frames_per_rig=num_images,
-        num_points3D=200,
+        num_points3D=num_points,
         camera_params=PARAMS,
     )
     assert cameras_that_tell_distortion(PairGraph.read(path)) == (

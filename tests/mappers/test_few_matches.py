@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from colmap_affrect.colmap.model_files import (
     relative_pose,
 )
 from colmap_affrect.geometry.arrays import Indices
-from colmap_affrect.mappers.few_matches import MAX_RAW, sure_few_matches
+from colmap_affrect.mappers.few_matches import MAX_RAW, _Closures, sure_few_matches
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 
@@ -97,6 +98,58 @@ def test_seven_matches_are_sure_where_a_third_image_confirms_them(
             change[1, other] = seven[:0]
     change_matches(path, change)
     assert ((1, 2) in sure_ids(path)) == is_confirmed
+
+
+@pytest.mark.parametrize(
+    ("num_wrong", "is_confirmed"), [(0, True), (1, True), (4, False), (20, False)]
+)
+def test_a_third_image_may_contradict_a_tenth_of_the_matches_that_it_confirms(
+    num_wrong: int, *, is_confirmed: bool
+) -> None:
+    """The features of each image are in an order of their own."""
+    first, second, third = np.random.default_rng(1).permuted(
+        np.tile(np.arange(50), (3, 1)), axis=1
+    )[:, :20]
+    of_third = second.copy()
+    of_third[:num_wrong] += 50  # other features of the second image
+    matches = {
+        (1, 2): np.stack([first, second], axis=1),
+        (1, 3): np.stack([first, third], axis=1),
+        (2, 3): np.stack([of_third, third], axis=1),
+    }
+    evidence = _Closures(matches).log10_evidence((1, 2), matches[1, 2])
+    num_agreeing = 20 - num_wrong
+    choices = math.log10(math.comb(20, num_wrong))  # which of them agree
+    expected = num_agreeing * math.log10(20.0) - choices if is_confirmed else 0.0
+    assert evidence == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("num_wrong", "is_sure"), [(2, True), (6, False)])
+def test_of_few_matches_four_fifths_must_agree(
+    tmp_path: Path, num_wrong: int, *, is_sure: bool
+) -> None:
+    path = tmp_path / "database.db"
+    targets(path, 24)
+    with open_database(path) as database:
+        raw = np.asarray(database.read_matches(1, 2), np.int64)
+    right = raw[:NUM_TARGETS]
+    others = raw[NUM_TARGETS : NUM_TARGETS + num_wrong]
+    wrong = np.stack([others[:, 0], np.roll(others[:, 1], 1)], axis=1)
+    change_matches(path, {(1, 2): np.concatenate([right, wrong])})
+    assert ((1, 2) in sure_ids(path)) == is_sure
+
+
+def test_of_two_third_images_the_better_one_counts_as_if_chance_had_tried_both() -> (
+    None
+):
+    rows = np.stack([np.arange(10), 9 - np.arange(10)], axis=1)
+    same = np.stack([np.arange(10), np.arange(10)], axis=1)
+    one = {(1, 2): rows, (1, 3): same, (2, 3): rows[:, ::-1]}
+    two = {**one, (1, 4): same, (2, 4): rows[:, ::-1]}
+    by_one = _Closures(one).log10_evidence((1, 2), rows)
+    assert by_one == pytest.approx(10.0)
+    by_two = _Closures(two).log10_evidence((1, 2), rows)
+    assert by_two == pytest.approx(10.0 - np.log10(2.0))
 
 
 def test_many_raw_matches_are_not_looked_at(tmp_path: Path) -> None:

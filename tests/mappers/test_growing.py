@@ -36,12 +36,13 @@ class Recorder(Adjuster):
         return super().adjust(model, max_iterations, *given, **more)
 
 
-def grower_of(path: Path) -> Grower:
+def grower_of(path: Path, init_min_num_inliers: int = 1) -> Grower:
     """What grows models of a database, and records its adjustments."""
     Recorder.calls.clear()
     task = task_with_given_cameras(path)
     graph = PairGraph.read(path)
-    native = mapper_of("sparse", init_min_num_inliers=1).native(task, SEED)
+    mapper = mapper_of("sparse", init_min_num_inliers=init_min_num_inliers)
+    native = mapper.native(task, SEED)
     priors = camera_priors(graph.cameras.values(), task.cameras, {})
     refining = native.get_global_bundle_adjustment()
     adjuster = Recorder(priors, NOISE_PX, refining, frozenset(priors))
@@ -73,6 +74,16 @@ def test_a_first_pair_needs_ten_points(
     grower.graph = PairGraph.read(tmp_path / "database.db", 1)
     (pair,) = grower.graph.pairs
     assert (grower.grow(pair.ids) is not None) == makes_a_model
+
+
+@pytest.mark.parametrize(("num_points", "least"), [(30, 24), (200, 40)])
+def test_a_first_pair_may_have_four_fifths_of_the_inliers_of_the_strongest_where_all_have_few(
+    tmp_path: Path, num_points: int, least: int
+) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=2, num_points3D=num_points)
+    grower = grower_of(tmp_path / "database.db", init_min_num_inliers=40)
+    assert max(len(pair.matches) for pair in grower.graph.pairs) == num_points
+    assert grower._options_of_first().init_min_num_inliers == least
 
 
 def test_a_restart_keeps_poses_and_finds_points_anew(tmp_path: Path) -> None:

@@ -244,6 +244,17 @@ def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return workspace
 
 
+def names_by_folder(sparse: Path) -> dict[str, tuple[str, ...]]:
+    """Return the names of the registered images of each model, by the name of its folder."""
+    found = {}
+    for folder in sparse.iterdir():
+        if folder.is_dir():
+            model = pycolmap.Reconstruction(folder)
+            names = sorted(model.images[i].name for i in model.reg_image_ids())
+            found[folder.name] = tuple(names)
+    return found
+
+
 @pytest.mark.parametrize(
     "mapper",
     [
@@ -255,20 +266,14 @@ def test_two_places_make_two_models_the_largest_first(
     two_places: Workspace, mapper: str
 ) -> None:
     report = map_and_report(Context(two_places), mapper_of(mapper), overwrite=True)
-    large = tuple(sorted(f"there/{name}" for name in NAMES[:3]))
-    small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
+    large = tuple(f"there/{name}" for name in sorted(NAMES[:3]))
+    small = tuple(f"here/{name}" for name in sorted(NAMES[:2]))
     assert [model.registered_names for model in report.models] == [large, small]
     assert report.status == "partial"
     assert report.unregistered == dict.fromkeys(small, Missing("another_group", 1))
     assert "models      2, of 3, 2 images" in report.summary()
     assert [*map(tuple, report.to_mapping()["models"])] == [large, small]
-    folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())
-    assert [folder.name for folder in folders] == ["0", "1"]
-    for folder, names in zip(folders, (large, small), strict=True):
-        model = pycolmap.Reconstruction(folder)
-        assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(
-            names
-        )
+    assert names_by_folder(two_places.sparse) == {"0": large, "1": small}
 
 
 @pytest.mark.parametrize(("min_model_size", "num_models"), [(3, 1), (4, 0), (2, 2)])

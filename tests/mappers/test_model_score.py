@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.model_score import (
     MIN_SCORE_GAIN,
     ModelScorer,
+    _seen_by_three,
     num_occupied_cells,
     pair_log_ratio,
 )
@@ -63,3 +66,23 @@ def test_images_from_one_viewpoint_do_not_confirm_each_other(tmp_path: Path) -> 
     assert min(scorer.track_log_ratios(model).values()) > MIN_SCORE_GAIN
     assert set(scorer.track_log_ratios(model, together).values()) == {0.0}
     assert scorer.track_log_ratios(model, {}) == scorer.track_log_ratios(model)
+
+
+def test_a_pair_counts_by_the_cells_of_the_image_in_which_they_are_fewer() -> None:
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", 500.0, 640, 480
+    )
+    spread = np.random.default_rng(0).uniform(0, (640, 480), (50, 2))
+    pair: Any = SimpleNamespace(ids=(1, 2))
+    for points in ((spread, spread / 8.0), (spread / 8.0, spread)):
+        both = SimpleNamespace(
+            cameras={1: camera, 2: camera}, points=lambda _, points=points: points
+        )
+        graph: Any = both
+        assert ModelScorer(graph, {}).num_cells(pair) == 1
+
+
+def test_long_tracks_are_points_that_images_from_three_viewpoints_see() -> None:
+    seen = {1: np.array([5, 6, -1, 7]), 2: np.array([6, 5, 7]), 3: np.array([-1, 5, 7])}
+    assert _seen_by_three(seen, {}).tolist() == [5, 7]
+    assert _seen_by_three(seen, {1: 1, 3: 1}).tolist() == []

@@ -16,7 +16,14 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers import pair_graph
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.pair_graph import (
+    PairGraph,
+    VerifiedPair,
+    _strongest,
+    cameras_of,
+    compared_with_pose,
+    poses_of,
+)
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
 
@@ -31,26 +38,35 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_thinned_graph_has_some_tracks_whole_and_enough_of_each_image(
-    path: Path,
-) -> None:
+def features_of_pairs(graph: PairGraph) -> dict[int, set[int]]:
+    """Return the features that are matched, by image id."""
+    found = defaultdict[int, set[int]](set)
+    for pair in graph.pairs:
+        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+            found[image_id].update(features.tolist())
+    return found
+
+
+def test_a_thinned_graph_has_enough_matches_of_each_pair_and_image(path: Path) -> None:
     graph = PairGraph.read(path)
     thin = graph.thinned()
     assert [pair.ids for pair in thin.pairs] == [pair.ids for pair in graph.pairs]
-    kept = defaultdict(set)
     for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
         assert NUM_MATCHES_OF_PAIR <= len(pair.matches) < len(whole.matches) / 2
         assert rows_in(pair.matches, whole.matches).all()
-        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
-            kept[image_id].update(features.tolist())
-    assert all(len(features) >= NUM_TRACKS for features in kept.values())
-    for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
-        inside = [
-            np.isin(whole.matches[:, i], list(kept[whole.ids[i]])) for i in (0, 1)
-        ]
-        assert (inside[0] == inside[1]).all()
-        assert inside[0].sum() == len(pair.matches)
+    assert min(map(len, features_of_pairs(thin).values())) >= NUM_TRACKS
     assert thin.thinned() is thin
+
+
+def test_a_thinned_graph_has_its_tracks_whole(path: Path) -> None:
+    graph = PairGraph.read(path)
+    thin = graph.thinned()
+    kept = features_of_pairs(thin)
+    for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
+        in_first = np.isin(whole.matches[:, 0], list(kept[whole.ids[0]]))
+        in_second = np.isin(whole.matches[:, 1], list(kept[whole.ids[1]]))
+        assert (in_first == in_second).all()
+        assert in_first.sum() == len(pair.matches)
 
 
 def test_a_model_of_some_tracks_gets_the_points_of_all(
@@ -170,6 +186,25 @@ def test_matches_agree_that_are_a_few_pixels_off_their_epipolar_lines(
     assert lowest_agreement(shifted(graph, 60.0), model) < 0.3
 
 
+def test_a_pose_explains_matches_of_cameras_with_other_focal_lengths() -> None:
+    wide = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
+    narrow = pycolmap.Camera.create_from_model_name(
+        2, "SIMPLE_PINHOLE", 1500.0, 640, 480
+    )
+    points = np.random.default_rng(2).uniform((-1, -1, 9), (1, 1, 12), (50, 3))
+    rotation = pycolmap.Rotation3d(np.array([0.03, -0.05, 0.1])).matrix()
+    translation = np.array([0.8, 0.3, 0.1])
+    there = points @ rotation.T + translation
+    seen = wide.img_from_cam(points), narrow.img_from_cam(there)
+    pose = rotation, translation / np.linalg.norm(translation)
+    found = compared_with_pose(pose, (wide, narrow), seen)
+    assert found.errors_px.max() < 1e-6
+    assert found.agrees.all()
+    length = np.linalg.norm(translation)
+    np.testing.assert_allclose(found.depths.first, points[:, 2] / length)
+    np.testing.assert_allclose(found.depths.second, there[:, 2] / length)
+
+
 def test_in_large_images_matches_may_be_farther_off(tmp_path: Path) -> None:
     model = synthesize(tmp_path / "database.db", num_rigs=3, num_points3D=300)
     graph = PairGraph.read(tmp_path / "database.db")
@@ -186,6 +221,17 @@ def test_only_the_strongest_pairs_of_an_image_score_models(tmp_path: Path) -> No
     assert min(counts.values()) == 15
     assert graph.weak
     assert len(graph.verified) == 190
+
+
+def test_a_pair_scores_models_that_is_among_the_strongest_of_one_of_its_images() -> (
+    None
+):
+    matches = np.zeros((20, 2), np.int64)
+    geometry = pycolmap.TwoViewGeometry()
+    star = [VerifiedPair((1, leaf), matches, geometry) for leaf in range(2, 22)]
+    strong, weak = _strongest(star)
+    assert len(strong) == 20
+    assert not weak
 
 
 def test_pairs_of_fewer_than_fifteen_inliers_are_left_out(tmp_path: Path) -> None:

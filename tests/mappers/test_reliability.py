@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import CameraPrior
+from colmap_affrect.mappers.pair_graph import VerifiedPair
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
 from colmap_affrect.project.reasons import Doubt
@@ -312,6 +315,23 @@ def test_mirrored_copy_is_told_from_the_photograph(tmp_path: Path) -> None:
     }
     assert originals.pop(images[1].name) == images[4].name
     assert set(originals.values()) == {""}
+
+
+def test_the_original_of_a_mirrored_copy_is_the_one_that_photographs_without_copies_agree_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mirrored = [(1, 2), (4, 5)]
+    monkeypatch.setattr(reliability_features, "_mirrored_pairs", lambda _: mirrored)
+    num_matches = {(1, 3): 20, (2, 3): 10, (2, 4): 100, (3, 4): 10, (3, 5): 30}
+    geometry = pycolmap.TwoViewGeometry()
+    pairs = []
+    for ids, num in num_matches.items():
+        pairs.append(VerifiedPair(ids, np.zeros((num, 2), np.int64), geometry))
+    context: Any = SimpleNamespace(
+        pairs=pairs, agreements=dict.fromkeys(num_matches, 0.9)
+    )
+    originals = reliability_features._mirrored_originals(context)
+    assert originals == {2: 1, 4: 5}
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,8 @@ from colmap_affrect.mappers.model_score import (
     ModelScorer,
     pair_log_ratio,
 )
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
-from colmap_affrect.mappers.search import Search, _Attempt
+from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of
+from colmap_affrect.mappers.search import Search, _Attempt, first_pairs
 from colmap_affrect.mappers.sparse import COLMAP_MODEL, PER_IMAGE_CAMERAS
 
 TRUE_FOCAL = 1280.0
@@ -455,6 +456,17 @@ def test_colmaps_own_model_is_taken_where_ours_scores_lower(
     assert not mapper_of("sparse").map(
         task_with_given_cameras(scene[0]), tmp_path, 0, lambda _: None
     )
+
+
+def test_models_begin_with_the_strongest_pairs_of_two_frames() -> None:
+    geometry = pycolmap.TwoViewGeometry()
+    pairs = []
+    for ids, num in (((1, 3), 20), ((1, 2), 90), ((2, 3), 40)):
+        pairs.append(VerifiedPair(ids, np.zeros((num, 2), np.int64), geometry))
+    frames = {1: 7, 2: 7, 3: 8}  # a rig took the first two images at once
+    images = {key: SimpleNamespace(frame_id=frame) for key, frame in frames.items()}
+    graph: Any = SimpleNamespace(cache=SimpleNamespace(images=images))
+    assert [pair.ids for pair in first_pairs(pairs, graph)] == [(2, 3), (1, 3), (1, 2)]
 
 
 def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:

@@ -219,12 +219,15 @@ def test_places_are_mapped_again_each_by_its_own_pairs_and_without_a_collage(
     }
 
 
-def test_models_stay_where_a_place_alone_makes_none(tmp_path: Path) -> None:
+@pytest.mark.parametrize("registered", [set(), {2}])
+def test_models_stay_where_a_place_alone_makes_none_of_most_of_its_photographs(
+    tmp_path: Path, registered: set[int]
+) -> None:
     path = tmp_path / "database.db"
     whole = MappedModel(scene(path, poster))
 
     def in_vain(_: PairGraph) -> list[MappedModel]:
-        return []
+        return [of_some(whole.reconstruction, registered)] if registered else []
 
     (found,) = with_places_mapped_again([whole], PairGraph.read(path), in_vain)
     assert found.reconstruction is whole.reconstruction

@@ -141,6 +141,22 @@ def test_inliers_stay_and_matches_are_one_to_one() -> None:
     )
 
 
+def test_features_that_are_matched_already_match_no_others() -> None:
+    """The features of image 2 are in another order than those of image 1."""
+    (descriptors, _), model = plane()
+    order = np.random.default_rng(2).permutation(200)
+    column_of = np.argsort(order)
+    points1, points2 = model.points
+    shuffled = HomographyModel(HOMOGRAPHY, (points1, points2[order]))
+    inliers = np.array([[0, column_of[1]], [2, column_of[5]]])
+    found = guided_matches(
+        (descriptors, descriptors[order]), None, shuffled, inliers, OPTIONS
+    )
+    others = np.setdiff1d(np.arange(200), [0, 1, 2, 5])
+    expected = np.concatenate([inliers, np.stack([others, column_of[others]], axis=1)])
+    assert_array_equal(found, expected[np.argsort(expected[:, 0])])
+
+
 @pytest.mark.parametrize("kind", [EpipolarModel, HomographyModel])
 def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(
     kind: type[PairModel],

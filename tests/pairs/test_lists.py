@@ -84,18 +84,27 @@ def neighbors(pairs: list[Pair], name: str) -> set[str]:
     return found - {name}
 
 
-def test_most_similar_pairs_are_asked_for_on_average_and_half_of_it_for_each() -> None:
+def test_most_similar_pairs_are_as_many_as_asked_for_on_average() -> None:
     names, similarity = crowd_and_few()
     pairs = most_similar_pairs(names, similarity, 4)
     assert len(pairs) == len(set(pairs)) == 12 * 4 // 2
     assert pairs == sorted(pairs)
     assert all(first < second for first, second in pairs)
+
+
+def test_each_photograph_has_half_as_many_of_its_most_similar_ones() -> None:
+    names, similarity = crowd_and_few()
+    pairs = most_similar_pairs(names, similarity, 4)
     for index, name in enumerate(names):
         order = np.argsort(-similarity[index])
         nearest = [names[other] for other in order[order != index][:2]]
         assert neighbors(pairs, name).issuperset(nearest)
+
+
+def test_pairs_that_are_over_go_to_the_crowd_although_the_few_have_some_left() -> None:
+    names, similarity = crowd_and_few()
+    pairs = most_similar_pairs(names, similarity, 4)
     of_crowd = [pair for pair in pairs if pair[0] < "08"]
-    # What is over goes to the crowd, although the few have pairs left.
     assert len(pairs) - len(of_crowd) < 6
     assert max(second for _, second in of_crowd) < "08"
 

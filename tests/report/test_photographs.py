@@ -37,22 +37,38 @@ def model(workspace: Workspace) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(str(workspace.sparse / "0"))
 
 
-def test_figures_of_photographs_are_those_of_the_model(
-    workspace: Workspace, model: pycolmap.Reconstruction
-) -> None:
+@pytest.fixture(scope="module")
+def photographs(workspace: Workspace) -> dict[str, PhotographReport]:
     report = small_report(workspace.path)
-    found = photographs_of_report(workspace, NAMES, report.models, report.cameras, {})
-    assert list(found) == list(NAMES)
-    first = found[NAMES[0]]
+    return dict(
+        photographs_of_report(workspace, NAMES, report.models, report.cameras, {})
+    )
+
+
+def points_of(image: pycolmap.Image) -> set[int]:
+    """The ids of the points that an image sees."""
+    return {mark.point3D_id for mark in image.get_observation_points2D()}
+
+
+def test_points_and_neighbours_of_a_photograph_are_those_of_the_model(
+    photographs: dict[str, PhotographReport], model: pycolmap.Reconstruction
+) -> None:
+    first = photographs[NAMES[0]]
     image = model.find_image_with_name(NAMES[0])
-    seen = {point.point3D_id for point in image.get_observation_points2D()}
-    assert first.num_points == len(seen)
+    assert first.num_points == len(points_of(image))
     shared = {}
     for other in model.images.values():
-        if other.has_pose and other.name != image.name:
-            ids = {point.point3D_id for point in other.get_observation_points2D()}
-            shared[other.name] = len(seen & ids)
-    assert first.neighbours == {name: num for name, num in shared.items() if num}
+        num_shared = len(points_of(image) & points_of(other))
+        if other.name != image.name and num_shared:
+            shared[other.name] = num_shared
+    assert first.neighbours == shared
+
+
+def test_error_and_focal_length_of_a_photograph_are_those_of_the_model(
+    photographs: dict[str, PhotographReport], model: pycolmap.Reconstruction
+) -> None:
+    first = photographs[NAMES[0]]
+    image = model.find_image_with_name(NAMES[0])
     errors = []
     for point in image.get_observation_points2D():
         place = image.project_point(model.points3D[point.point3D_id].xyz)
@@ -61,8 +77,15 @@ def test_figures_of_photographs_are_those_of_the_model(
     camera = model.cameras[image.camera_id]
     assert first.focal_px == pytest.approx(camera.mean_focal_length(), abs=0.1)
     assert (first.focal_start_px, first.focal_source) == (200.0, "exif")
+
+
+def test_each_photograph_has_a_quality_and_a_model(
+    photographs: dict[str, PhotographReport],
+) -> None:
+    assert list(photographs) == list(NAMES)
+    first = photographs[NAMES[0]]
     assert (first.quality, first.model, first.probability) == ("sure", 0, 0.99)
-    assert found[NAMES[5]].quality == "missing"
+    assert photographs[NAMES[5]].quality == "missing"
 
 
 def test_a_photograph_without_a_probability_is_not_sure() -> None:

@@ -199,6 +199,15 @@ def write_bad_images(folder: Path) -> None:
 
 
 @pytest.mark.long
+def assert_formats_are_named(failures: dict[str, str], folder: Path) -> None:
+    """Files of other formats than their names say are no images for COLMAP."""
+    for kind, name in FORMATS.items():
+        why = failures[f"{kind}.jpg"]
+        assert f"is of the format {name}, which COLMAP cannot read" in why
+        # So it is in truth, or the rule would keep good images out.
+        assert pycolmap.Bitmap.read(folder / f"{kind}.jpg", as_rgb=False) is None
+
+
 def test_bad_images_are_named_and_the_others_registered(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
@@ -228,13 +237,7 @@ def test_bad_images_are_named_and_the_others_registered(
         >= FAILING
         >= set(failures) - {"half.jpg", "half.png", "noise.jpg"}
     )
-    for kind, name in FORMATS.items():
-        assert (
-            f"is of the format {name}, which COLMAP cannot read"
-            in failures[f"{kind}.jpg"]
-        )
-        # So it is in truth, or the rule would keep good images out.
-        assert pycolmap.Bitmap.read(trio / f"{kind}.jpg", as_rgb=False) is None
+    assert_formats_are_named(failures, trio)
     assert set(TRIO) <= set(ended.report["registered_names"])
     assert (ended.code, len(ended.errors)) == (1, 1)
     assert all(name in ended.errors[0] for name in failures)

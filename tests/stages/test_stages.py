@@ -14,13 +14,13 @@ from unittest.mock import Mock
 import h5py
 import numpy as np
 import pytest
+from adviser import AGAIN, Adviser
 from command import CAMERA, Call, pair_list
 from numpy.testing import assert_array_equal
 from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES
 from verified import CAMERAS, copy_of
 
-from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
@@ -35,7 +35,6 @@ from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import (
     Bridge,
     MatchedAgain,
-    ModelSummary,
     ReconstructionReport,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -88,6 +87,12 @@ def without_times(report: dict[str, object]) -> dict[str, object]:
     }
 
 
+RESULTS = {
+    "config.toml", "database.db", "features.h5", "matches.h5", "pairs.txt", "report.html",
+    "report.json", "sparse",
+}  # fmt: skip
+
+
 def test_run_registers_all_photographs_and_leaves_all_results(
     finished: Finished,
 ) -> None:
@@ -95,14 +100,21 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     assert report.status == "ok"
     assert report.registered_names == tuple(sorted(NAMES))
     assert report.unregistered == {}
+    assert {path.name for path in workspace.path.iterdir()} >= RESULTS
+    assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
     assert (report.num_pairs, report.num_verified_pairs) == (6, 6)
-    assert report.models[0].num_points3D > 300
-    assert 2.0 <= report.models[0].mean_track_length <= 4.0
-    assert 0.0 < report.models[0].mean_reprojection_error_px < 1.0
-    assert {
-        "config.toml", "database.db", "features.h5", "matches.h5", "pairs.txt", "report.json",
-        "report.html", "sparse",
-    } <= {path.name for path in workspace.path.iterdir()}  # fmt: skip
+
+
+def test_run_says_how_good_its_model_is(finished: Finished) -> None:
+    _, report = finished
+    (model,) = report.models
+    assert model.num_points3D > 300
+    assert 2.0 <= model.mean_track_length <= 4.0
+    assert 0.0 < model.mean_reprojection_error_px < 1.0
+
+
+def test_model_of_a_run_has_the_camera_that_was_given(finished: Finished) -> None:
+    workspace, report = finished
     model = pycolmap.Reconstruction(workspace.sparse / "0")
     names = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
     assert names == list(report.registered_names)
@@ -110,21 +122,26 @@ def test_run_registers_all_photographs_and_leaves_all_results(
     assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
     assert (camera.width, camera.height) == IMAGE_SIZE
     (record,) = read_camera_records(workspace.cameras).values()
-    assert (record.names, record.source, record.is_all_given) == (
-        tuple(names),
-        "given",
-        True,
-    )
-    assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
+    assert record.names == tuple(names)
+    assert (record.source, record.is_all_given) == ("given", True)
+
+
+def test_run_leaves_the_options_of_all_its_stages(finished: Finished) -> None:
+    workspace, _ = finished
     stages = ["extract", "pairs", "match", "verify", "escalate", "guide", "map"]
     assert workspace.record().keys() == {"recipe", *stages, "made_from", "mapped"}
     assert workspace.started_stages == stages
-    lines = FeatureStore(workspace.features).lines_of([names[0]]).get(names[0])
+
+
+def test_report_and_page_say_what_lines_were_found(finished: Finished) -> None:
+    workspace, report = finished
+    name = NAMES[0]
+    lines = FeatureStore(workspace.features).lines_of([name]).get(name)
     assert lines is not None
-    assert report.lines.keys() == set(names)
-    assert report.lines[names[0]].num_segments == len(lines.segments)
+    assert report.lines.keys() == set(NAMES)
+    assert report.lines[name].num_segments == len(lines.segments)
     said = json.loads(workspace.report.read_text(encoding="utf-8"))["lines"]
-    assert said[names[0]]["num_segments"] == len(lines.segments)
+    assert said[name]["num_segments"] == len(lines.segments)
     assert 'id="lines"' in workspace.page.read_text(encoding="utf-8")
 
 
@@ -196,78 +213,101 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
     assert made.config.read_bytes() == expected.config.read_bytes()
 
 
-def test_advice_is_about_what_is_wrong(
-    finished: Finished, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    workspace, report = finished
-    command = (
-        "colmap-affrect",
-        "run",
-        "--image-path",
-        "a b",
-        "--output-path",
-        "out",
-        "-q",
-    )
-    context = Context(workspace, command=command)
-    (model, *_) = report.models
-    lost = NAMES[0]
-    wanted = str(workspace.path.with_name(f"{workspace.path.name}-2"))
-
+@pytest.fixture
+def adviser(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> Adviser:
     monkeypatch.setattr(Workspace, "recipe", lambda _: "rectified")
+    workspace, report = finished
+    context = Context(workspace, command=tuple(shlex.split(AGAIN)))
+    return Adviser(context, report.models[0])
 
-    def commands(
-        missing: list[str], model: ModelSummary, at: Context = context
-    ) -> list[str]:
-        found = [one.command for one in advice(at, missing, [model], 0)]
-        for words in filter(None, found):  # the parser takes what is advised
-            build_parser().parse_args(shlex.split(words)[1:])
-        return found
 
-    assert commands(["unreadable.png"], model) == []
-    again = "colmap-affrect run --image-path 'a b' --output-path out -q"
-    anew = f"colmap-affrect run --image-path 'a b' -q {{}} --output-path {wanted}"
-    tied = f"{again} --tie-points tie-points.csv"
-    more = anew.format("--recipe default")
-    assert commands([lost], model) == [more, tied, ""]
-    unknown = replace(model, doubtful={lost: (Doubt("focal_unknown"),)})
-    assert commands([], unknown) == [anew.format("--focal-mm 50 --film-width-mm 36")]
+LOST = NAMES[0]
+
+
+def test_for_a_lost_photograph_the_best_recipe_and_tie_points_are_advised(
+    adviser: Adviser,
+) -> None:
+    more = adviser.anew("--recipe default")
+    tied = f"{AGAIN} --tie-points tie-points.csv"
+    assert adviser.commands([LOST]) == [more, tied, ""]
+    assert adviser.commands(["unreadable.png"]) == []
+
+
+def test_focal_lengths_are_advised_where_they_are_unknown_or_contradicted(
+    adviser: Adviser,
+) -> None:
+    unknown = {LOST: (Doubt("focal_unknown"),)}
+    by_film = adviser.anew("--focal-mm 50 --film-width-mm 36")
+    assert adviser.commands([], doubtful=unknown) == [by_film]
     contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
-    wrong = replace(model, taken_out={lost: (contradicted,)})
-    assert commands([lost], wrong)[0] == anew.format("--focal-length-px 8")
-    little = Doubt("little_agreement", {"percent": 9})
-    disputed = replace(model, doubtful={lost: (little,)}, gains={lost: 0.3})
-    assert commands([], disputed) == [more, anew.format("--mask-path masks")]
-    bridged = {lost: Bridge(NAMES[1], 5, 9, 0.2)}
-    alone = replace(model, doubtful={lost: (Doubt("few_matches"),)}, bridges=bridged)
-    assert commands([], alone) == []  # nothing contradicts its matches
-    bridged_wrongly = replace(disputed, gains={}, bridges=bridged)
-    assert commands([], bridged_wrongly) == [
-        f"{again} --reject-pair '{lost},{NAMES[1]}'",
-        anew.format("--mask-path masks"),
-    ]
-    said = replace(context, by_hand=ByHand(tie_points_path=Path("t.csv")), command=())
-    (_, tie_points, _) = advice(said, [lost], [model], 0)
-    assert tie_points.why.startswith(
-        "no point of t.csv is seen by two photographs of one model"
-    )
+    found = adviser.commands([LOST], taken_out={LOST: (contradicted,)})
+    assert found[0] == adviser.anew("--focal-length-px 8")
+
+
+def test_masks_and_rejected_pairs_are_advised_where_matches_contradict_a_pose(
+    adviser: Adviser,
+) -> None:
+    masks = adviser.anew("--mask-path masks")
+    more = adviser.anew("--recipe default")
+    bridged = {LOST: Bridge(NAMES[1], 5, 9, 0.2)}
+    little = {LOST: (Doubt("little_agreement", {"percent": 9}),)}
+    assert adviser.commands([], doubtful=little, gains={LOST: 0.3}) == [more, masks]
+    rejecting = f"{AGAIN} --reject-pair '{LOST},{NAMES[1]}'"
+    found = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
+    assert found == [rejecting, masks]
+    few = {LOST: (Doubt("few_matches"),)}
+    assert adviser.commands([], doubtful=few, bridges=bridged) == []
+
+
+def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
+    adviser: Adviser,
+) -> None:
+    model = adviser.model
+    by_hand = ByHand(tie_points_path=Path("t.csv"))
+    said = replace(adviser.context, by_hand=by_hand, command=())
+    (_, tie_points, _) = advice(said, [LOST], [model], 0)
+    why = "no point of t.csv is seen by two photographs of one model"
+    assert tie_points.why.startswith(why)
     assert tie_points.command.startswith("colmap-affrect map --output-path ")
     given = replace(said, command=("colmap-affrect", "map", "--tie-points", "t.csv"))
-    (_, tie_points, _) = advice(given, [lost], [model, model], 0)
+    (_, tie_points, _) = advice(given, [LOST], [model, model], 0)
     assert tie_points.why.endswith("join two models")
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
-    (disagreeing,) = advice(context, [*NAMES], [], 900)
-    assert "contradict each other" in disagreeing.why
-    monkeypatch.setattr(advice_module, "_share_without_depth", lambda _: 0.95)
-    (copies,) = advice(context, [*NAMES], [], 900)
-    assert "show no depth" in copies.why
+
+
+@pytest.mark.parametrize(
+    ("share_without_depth", "why"),
+    [
+        (0.5, "contradict each other"),
+        (0.85, "contradict each other"),
+        (0.95, "show no depth"),
+    ],
+)
+def test_strong_pairs_that_make_no_model_contradict_each_other_or_show_no_depth(
+    adviser: Adviser,
+    monkeypatch: pytest.MonkeyPatch,
+    share_without_depth: float,
+    why: str,
+) -> None:
+    share = Mock(return_value=share_without_depth)
+    monkeypatch.setattr(advice_module, "_share_without_depth", share)
+    (found,) = advice(adviser.context, [*NAMES], [], 900)
+    assert why in found.why
+
+
+def test_matches_of_a_scene_with_depth_show_it(adviser: Adviser) -> None:
+    (found,) = advice(adviser.context, [*NAMES], [], 900)
+    assert "contradict each other" in found.why
+
+
+def test_weights_are_advised_where_the_best_recipe_lacks_them(
+    adviser: Adviser, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
-    monkeypatch.setattr(
-        Resources, "commands_to_complete", lambda *_: ["pip install it", "fetch it"]
-    )
-    assert (
-        advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
-    )
+    missing = Mock(return_value=["pip install it", "fetch it"])
+    monkeypatch.setattr(Resources, "commands_to_complete", missing)
+    (weights, *_) = advice(adviser.context, [LOST], [adviser.model], 0)
+    assert weights.command == f"pip install it && {AGAIN}"
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:

@@ -1,0 +1,116 @@
+"""What images weigh that are matched again: by what more matches may bring to each."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from colmap_affrect.escalation.expected_gain import (
+    Candidate,
+    LevelStatistics,
+    PairState,
+    StepPlanner,
+    _Selection,
+)
+from colmap_affrect.escalation.set_state import SetState, _megapixels
+from colmap_affrect.project.reasons import Doubt
+from colmap_affrect.project.report import SURE, ModelSummary
+from colmap_affrect.recipes import EscalateOptions
+
+NAMES = ["doubtful.jpg", "likely.jpg", "missing.jpg", "out.jpg", "sure.jpg"]
+
+
+def state_of(names: list[str], left_out: tuple[str, ...]) -> SetState:
+    """Return the state of a set that is mapped, of which nothing else is known."""
+    context: Any = SimpleNamespace(
+        listed_pairs=list,
+        extraction=SimpleNamespace(levels=()),
+        features=SimpleNamespace(names=lambda: names),
+        by_hand=SimpleNamespace(left_out=left_out),
+        workspace=SimpleNamespace(model_inputs=lambda: "these"),
+        current_model_inputs=lambda: "these",
+    )
+    return SetState(context, EscalateOptions())
+
+
+def test_an_image_that_is_likely_right_weighs_a_quarter_of_what_it_may_gain() -> None:
+    registered = ("doubtful.jpg", "likely.jpg", "sure.jpg")
+    model = ModelSummary(
+        registered_names=registered,
+        num_points3D=90,
+        mean_track_length=3.0,
+        mean_reprojection_error_px=0.5,
+        probabilities={"doubtful.jpg": 0.1, "likely.jpg": 0.7, "sure.jpg": SURE},
+        gains={"doubtful.jpg": 0.8, "likely.jpg": 0.2, "sure.jpg": 0.01},
+        doubtful={"doubtful.jpg": (Doubt("few_matches"),)},
+    )
+    weights = state_of(NAMES, left_out=("out.jpg",)).weights([model])
+    assert weights == pytest.approx(
+        {"doubtful.jpg": 0.8, "likely.jpg": 0.05, "missing.jpg": 1.0}
+    )
+
+
+def test_inliers_of_a_pair_are_found_whichever_image_is_the_first() -> None:
+    state = state_of(NAMES, ())
+    listed = [("a", "b"), ("a", "c"), ("b", "c")]
+    context: Any = state.context
+    context.num_verified_inliers = lambda: {("a", "b"): 20, ("c", "a"): 30}
+    context.usable = lambda _: listed
+    assert state.num_inliers() == {("a", "b"): 20, ("a", "c"): 30, ("b", "c"): 0}
+
+
+def test_images_that_measured_frames_connect_to_likely_ones_are_anchored() -> None:
+    state = state_of(NAMES, ())
+    state.is_measured = [True, False]
+    model = ModelSummary(
+        registered_names=("likely", "measured", "learned", "unverified"),
+        num_points3D=90,
+        mean_track_length=3.0,
+        mean_reprojection_error_px=0.5,
+        doubtful={
+            name: (Doubt("few_matches"),)
+            for name in ("measured", "learned", "unverified")
+        },
+    )
+    states = {
+        ("likely", "measured"): PairState(num_inliers=30),
+        ("learned", "likely"): PairState(num_inliers=30, level=1),
+        ("likely", "unverified"): PairState(num_inliers=0),
+        ("likely", "in no model"): PairState(num_inliers=30),
+    }
+    assert state._anchored(model, states) == {"likely", "measured"}
+
+
+@pytest.mark.parametrize(
+    ("size", "megapixels"),
+    [((4000, 3000), 0.75), ((3000, 4000), 0.75), ((800, 600), 0.48)],
+)
+def test_photographs_count_as_large_as_they_are_shrunk_to(
+    size: tuple[int, int], megapixels: float
+) -> None:
+    assert _megapixels(size, 1000) == pytest.approx(megapixels)
+
+
+def test_features_that_several_pairs_need_are_paid_once() -> None:
+    megapixels = {"a": 1.0, "b": 2.0, "c": 3.0}
+    planner: Any = SimpleNamespace(megapixels=megapixels, lacking={"a", "b", "c"})
+    statistics = LevelStatistics(coefficients={}, image_s=10.0, pair_s=1.0)
+    selection = _Selection(planner, statistics, seconds=0.0)
+    first = Candidate(("a", "b"), 0.5, ())
+    second = Candidate(("b", "c"), 0.5, ())
+    assert selection.seconds_of(first) == 10.0 * (1.0 + 2.0) + 2.0
+    selection.add(first)
+    assert selection.seconds_of(second) == 10.0 * 3.0 + 3.0
+
+
+def test_a_level_wins_pairs_that_it_verifies_and_loses_those_it_was_tried_for() -> None:
+    states = {
+        ("a", "b"): PairState(num_inliers=20, level=1, tried=0b11),
+        ("a", "c"): PairState(num_inliers=0, level=1, tried=0b11),
+        ("b", "c"): PairState(num_inliers=20, level=0, tried=0b11),
+        ("b", "d"): PairState(num_inliers=20, level=0, tried=0b01),
+    }
+    planner = StepPlanner(states, set(), {}, {}, (), (), (), 100)
+    assert planner._wins_and_losses(1) == (1, 2)
