@@ -231,17 +231,8 @@ class Adjuster:
             return math.inf
         return float(summary.final_cost) / self.noise_px**2
 
-    def pose_covariance(
-        self, model: pycolmap.Reconstruction
-    ) -> pycolmap.BACovariance | None:
-        """Return the covariance of the poses of a model that has been adjusted.
-
-        Three points are constant, which changes nothing of what does not depend on the frame of the
-        model, as relative directions. It is in units in which keypoints have a variance of one.
-
-        Returns:
-            The covariance, None where it cannot be computed.
-        """
+    def whole_problem(self, model: pycolmap.Reconstruction) -> Any:
+        """Return Ceres' problem of all images of a model, whose frame nothing fixes."""
         images = sorted(model.reg_image_ids())
         cameras = {model.images[image_id].camera_id for image_id in images}
         config = self._config(
@@ -250,11 +241,7 @@ class Adjuster:
             constant_cameras=cameras & self.constant,
             fix_gauge=False,
         )
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-        problem = self._problem(model, config, cameras - self.constant)
-        wanted = pycolmap.BACovarianceOptions()
-        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
-        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+        return self._problem(model, config, cameras - self.constant)
 
     def _problem(
         self,

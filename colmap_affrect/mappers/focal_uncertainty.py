@@ -1,0 +1,137 @@
+"""How uncertain the focal lengths of a model are, each and all together.
+
+The joint covariance (:mod:`colmap_affrect.mappers.covariance`) has what poses, points, principal
+points and all other focal lengths leave open. So it has what no trial of one camera finds: all
+focal lengths of some prints may grow at once.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyceres
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.adjustment import Adjuster
+from colmap_affrect.mappers.camera_priors import MIN_FOCAL_PX
+from colmap_affrect.mappers.covariance import ALL, CovarianceProblem
+
+TIE_SIGMA = 1e-4
+"""By which the mean of the logarithms of the focal lengths may differ from the unknown that is
+added for it: far less than any focal length is known to; numeric."""
+
+
+@dataclass(frozen=True)
+class FocalSigmas:
+    """Standard deviations of the logarithms of focal lengths."""
+
+    own: dict[int, float]  # by camera id
+    mean: float  # of the mean of all: how far they may grow together
+
+
+class MeanFocalCost(pyceres.CostFunction):  # type: ignore[misc]
+    """Ties an unknown to the mean of the logarithms of some focal lengths.
+
+    The covariance of that unknown is the variance of the mean. COLMAP does not tell it otherwise:
+    it has no covariances of two cameras.
+    """
+
+    def __init__(self, cameras: Sequence[pycolmap.Camera], sigma: float) -> None:
+        """Begin.
+
+        Args:
+            cameras: Whose parameters are the first blocks; the unknown is the last one.
+            sigma: By which it may differ from the mean, in units of the residuals of the problem.
+        """
+        super().__init__()
+        self.focals = [list(camera.focal_length_idxs()) for camera in cameras]
+        self.weight = 1.0 / sigma
+        self.set_num_residuals(1)
+        sizes = [len(camera.params) for camera in cameras]
+        self.set_parameter_block_sizes([*sizes, 1])
+
+    def Evaluate(
+        self, parameters: list[Array], residuals: Array, jacobians: list[Array] | None
+    ) -> bool:
+        """Compute the residual; see Ceres' CostFunction.
+
+        Args:
+            parameters: The blocks.
+            residuals: Of one number, changed in place.
+            jacobians: One for each block, changed in place; None where none is wanted.
+
+        Returns:
+            Whether that was possible.
+        """
+        number = len(self.focals)
+        mean = 0.0
+        for params, focal in zip(parameters[:-1], self.focals, strict=True):
+            focals_px = np.maximum(params[focal], MIN_FOCAL_PX)
+            mean += float(np.mean(np.log(focals_px))) / number
+        residuals[0] = self.weight * (mean - parameters[-1][0])
+        if jacobians is None:
+            return True
+        for index, focal in enumerate(self.focals):
+            if jacobians[index] is not None:
+                focals_px = np.maximum(parameters[index][focal], MIN_FOCAL_PX)
+                slopes = np.zeros(len(parameters[index]))
+                slopes[focal] = self.weight / (number * len(focal) * focals_px)
+                jacobians[index][:] = slopes
+        if jacobians[-1] is not None:
+            jacobians[-1][:] = -self.weight
+        return True
+
+
+def focal_sigmas(
+    model: pycolmap.Reconstruction, adjuster: Adjuster, camera_ids: Sequence[int]
+) -> FocalSigmas | None:
+    """Return how uncertain focal lengths are while all else of a model may move.
+
+    Args:
+        model: That has been adjusted.
+        adjuster: With the priors of its cameras.
+        camera_ids: Cameras whose focal lengths are refined, one at least.
+
+    Returns:
+        The deviations, None where they cannot be computed.
+    """
+    joint = CovarianceProblem.of(model, adjuster)
+    if joint is None:
+        return None
+    cameras = [joint.model.cameras[key] for key in camera_ids]
+    blocks = [camera.params for camera in cameras]
+    if not all(map(joint.problem.has_parameter_block, blocks)):
+        return None
+    mean = np.zeros(1)
+    joint.add(MeanFocalCost(cameras, TIE_SIGMA / adjuster.noise_px), [*blocks, mean])
+    covariance = joint.covariance(ALL)
+    if covariance is None:
+        return None
+    own = dict[int, float]()
+    for key, camera in zip(camera_ids, cameras, strict=True):
+        own[key] = _log_focal_sigma(camera, covariance)
+    of_mean = covariance.get_other_params_cov(mean)
+    mean_sigma = math.inf if of_mean is None else math.sqrt(max(of_mean[0, 0], 0.0))
+    if not math.isfinite(mean_sigma + sum(own.values())):
+        return None
+    scaled = {key: adjuster.noise_px * sigma for key, sigma in own.items()}
+    return FocalSigmas(scaled, adjuster.noise_px * mean_sigma)
+
+
+def _log_focal_sigma(
+    camera: pycolmap.Camera, covariance: pycolmap.BACovariance
+) -> float:
+    """Return the deviation of the mean logarithm of the focal lengths of a camera.
+
+    Of cameras that are not refined it is infinite. Focal lengths are the first free parameters.
+    """
+    of_camera = covariance.get_other_params_cov(camera.params)
+    if of_camera is None:
+        return math.inf
+    indices = list(camera.focal_length_idxs())
+    number = len(indices)
+    slopes = 1.0 / (number * np.maximum(camera.params[indices], MIN_FOCAL_PX))
+    variance = float(slopes @ of_camera[:number, :number] @ slopes)
+    return math.sqrt(max(variance, 0.0))
