@@ -220,7 +220,7 @@ class Adjuster:
             fix_gauge=image_ids is None,
         )
         problem = self._problem(model, config, cameras - constant)
-        solver = _solver_options(max_iterations, len(images))
+        solver = solver_options(max_iterations, len(images))
         if early_stop:
             early_stop.noise_px = self.noise_px
             solver.callbacks = [early_stop]
@@ -362,7 +362,8 @@ class Adjuster:
         )
 
 
-def _solver_options(max_iterations: int, num_images: int) -> Any:
+def solver_options(max_iterations: int, num_images: int) -> Any:
+    """Return Ceres' options for an adjustment of so many images."""
     options = pyceres.SolverOptions()
     options.max_num_iterations = max_iterations
     options.num_threads = 1

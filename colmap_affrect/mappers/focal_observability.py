@@ -5,7 +5,7 @@ length fits, and where it lowers the cost, a given one is wrong.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,10 @@ from colmap_affrect.mappers.camera_priors import (
     camera_priors,
     with_distortion_of,
 )
-from colmap_affrect.mappers.focal_uncertainty import focal_sigmas
+from colmap_affrect.mappers.focal_uncertainty import (
+    adjust_common_factor,
+    focal_sigmas,
+)
 from colmap_affrect.mappers.model_score import num_occupied_cells
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -177,9 +180,10 @@ def fitting_focals(
         priors: Priors of the focal lengths, by camera id.
 
     Returns:
-        The focal lengths in px by id of the camera. Empty where freeing the given ones lowers the
-        cost by less than free parameters are worth (BIC): half the logarithm of the number of
-        observations each, of which those in one cell of an image count once.
+        The focal lengths in px by id of the camera. Empty where freeing the given ones, each or by
+        one factor all together, lowers the cost by less than free parameters are worth (BIC): half
+        the logarithm of the number of observations each, of which those in one cell of an image
+        count once.
     """
     recorded = priors.keys() & task.cameras.keys()
     given = {key for key in recorded if "focal" in task.cameras[key].given}
@@ -195,18 +199,31 @@ def fitting_focals(
     given_cost = Adjuster(
         priors=priors, noise_px=NOISE_PX, refining=refining, constant=constant
     ).adjust(given_model, FINAL)
-    free_model = with_fewer_points(model)
-    free_cost = Adjuster(
-        priors=free_priors, noise_px=NOISE_PX, refining=refining
-    ).adjust(free_model, FINAL)
     num = num_independent(given_model)
-    num_observations = max(1, given_model.compute_num_observations())
-    gain = (given_cost - free_cost) * (num / num_observations)
-    if gain < 0.5 * len(given) * np.log(max(2, num)):
-        return {}
+    per_parameter = 0.5 * math.log(max(2, num))
+    weight = num / max(1, given_model.compute_num_observations())
+    free = Adjuster(priors=free_priors, noise_px=NOISE_PX, refining=refining)
+    free_model = with_fewer_points(model)
+    gain = given_cost - free.adjust(free_model, FINAL)
+    if gain * weight >= len(given) * per_parameter:
+        return _moved_focals(free_model, priors, given)
+    # What is wrong in the same way everywhere is one parameter.
+    common_model = with_fewer_points(model)
+    gain = given_cost - adjust_common_factor(common_model, free, sorted(given))
+    if gain * weight >= per_parameter:
+        return _moved_focals(common_model, priors, given)
+    return {}
+
+
+def _moved_focals(
+    model: pycolmap.Reconstruction,
+    priors: Mapping[int, CameraPrior],
+    given: Collection[int],
+) -> dict[int, float]:
+    """Return the focal lengths in px of a model that are not those that were given."""
     found = {}
     for key in sorted(given):
-        focal_px = float(free_model.cameras[key].mean_focal_length())
+        focal_px = float(model.cameras[key].mean_focal_length())
         if abs(math.log(focal_px / priors[key].focal_px)) > MIN_MOVE:
             found[key] = focal_px
     return found

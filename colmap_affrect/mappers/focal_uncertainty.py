@@ -14,13 +14,17 @@ import pyceres
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.mappers.adjustment import Adjuster
+from colmap_affrect.mappers.adjustment import FINAL, Adjuster, solver_options
 from colmap_affrect.mappers.camera_priors import MIN_FOCAL_PX
 from colmap_affrect.mappers.covariance import ALL, CovarianceProblem
 
 TIE_SIGMA = 1e-4
 """By which the mean of the logarithms of the focal lengths may differ from the unknown that is
 added for it: far less than any focal length is known to; numeric."""
+
+COMMON_SIGMA = 1e-3
+"""By which logarithms of focal lengths that grow together may differ: less than any is known to,
+and enough for the solver to move them; numeric."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,81 @@ class MeanFocalCost(pyceres.CostFunction):  # type: ignore[misc]
         if jacobians[-1] is not None:
             jacobians[-1][:] = -self.weight
         return True
+
+
+class CommonFactorCost(pyceres.CostFunction):  # type: ignore[misc]
+    """Ties the focal length of a camera to a factor that it has in common with others."""
+
+    def __init__(self, camera: pycolmap.Camera, sigma: float) -> None:
+        """Begin.
+
+        Args:
+            camera: With the focal length for which the factor is one. Its parameters are the first
+                block, the logarithm of the factor is the second one.
+            sigma: By which the logarithms may differ, in units of the residuals of the problem.
+        """
+        super().__init__()
+        self.focal = list(camera.focal_length_idxs())
+        self.focals_px = np.maximum(camera.params[self.focal], MIN_FOCAL_PX)
+        self.weight = 1.0 / sigma
+        self.set_num_residuals(1)
+        self.set_parameter_block_sizes([len(camera.params), 1])
+
+    def Evaluate(
+        self, parameters: list[Array], residuals: Array, jacobians: list[Array] | None
+    ) -> bool:
+        """Compute the residual; see Ceres' CostFunction.
+
+        Args:
+            parameters: The blocks.
+            residuals: Of one number, changed in place.
+            jacobians: One for each block, changed in place; None where none is wanted.
+
+        Returns:
+            Whether that was possible.
+        """
+        focals_px = np.maximum(parameters[0][self.focal], MIN_FOCAL_PX)
+        factor = float(np.mean(np.log(focals_px / self.focals_px)))
+        residuals[0] = self.weight * (factor - parameters[1][0])
+        if jacobians is None:
+            return True
+        if jacobians[0] is not None:
+            slopes = np.zeros(len(parameters[0]))
+            slopes[self.focal] = self.weight / (len(self.focal) * focals_px)
+            jacobians[0][:] = slopes
+        if jacobians[1] is not None:
+            jacobians[1][:] = -self.weight
+        return True
+
+
+def adjust_common_factor(
+    model: pycolmap.Reconstruction, adjuster: Adjuster, camera_ids: Sequence[int]
+) -> float:
+    """Adjust a model while some focal lengths may grow by one factor, all together.
+
+    Args:
+        model: Changed in place.
+        adjuster: With priors by which these focal lengths are free.
+        camera_ids: Their cameras.
+
+    Returns:
+        The cost as of :meth:`Adjuster.adjust`, infinite if the adjustment fails.
+    """
+    problem = adjuster.whole_problem(model)
+    log_factor = np.zeros(1)
+    costs = []  # Ceres does not keep them alive
+    for key in camera_ids:
+        camera = model.cameras[key]
+        if problem.has_parameter_block(camera.params):
+            cost = CommonFactorCost(camera, COMMON_SIGMA / adjuster.noise_px)
+            costs.append(cost)
+            problem.add_residual_block(cost, None, [camera.params, log_factor])
+    summary = pyceres.SolverSummary()
+    pyceres.solve(solver_options(FINAL, model.num_reg_images()), problem, summary)
+    model.update_point_3d_errors()
+    if not summary.IsSolutionUsable():
+        return math.inf
+    return float(summary.final_cost) / adjuster.noise_px**2
 
 
 def focal_sigmas(

@@ -15,7 +15,11 @@ from colmap_affrect.mappers import focal_observability
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import USUAL_SIGMA, CameraPrior
-from colmap_affrect.mappers.focal_observability import MIN_GROWTH, focal_growths
+from colmap_affrect.mappers.focal_observability import (
+    MIN_GROWTH,
+    fitting_focals,
+    focal_growths,
+)
 from colmap_affrect.mappers.focal_uncertainty import focal_sigmas
 
 IDS = (1, 2, 3, 4)
@@ -118,3 +122,25 @@ def test_where_there_is_no_covariance_other_focal_lengths_are_tried(
     assert by_trials.keys() == by_covariance.keys()
     for key, growth in by_trials.items():
         assert 0.2 < by_covariance[key] / growth < 5.0
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, {}), (0.8, IDS), (1.3, IDS)])
+def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
+    factor: float, expected: tuple[int, ...]
+) -> None:
+    """Each alone may be right by the points: that all change together is one parameter."""
+    model = model_of(FAR, 0.7, turns_deg=(0.0, 3.0, -2.0, 1.0))
+    records = {}
+    for key in IDS:
+        focal_px = factor * FOCAL_PX
+        model.cameras[key].params = [focal_px, 800.0, 600.0, 0.0]
+        given = ("focal", "distortion")
+        records[key] = CameraRecord((f"{key}.jpg",), "given", focal_px, given=given)
+    priors = {key: CameraPrior(factor * FOCAL_PX, 0.0) for key in IDS}
+    refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
+    Adjuster(priors, NOISE_PX, refining).adjust(model, FINAL)
+    task = MappingTask(Path("none.db"), None, cameras=records)
+    found = fitting_focals(model, task, priors)
+    assert found.keys() == set(expected)
+    for focal_px in found.values():
+        assert focal_px == pytest.approx(FOCAL_PX, rel=0.05)
