@@ -7,7 +7,7 @@ seven numbers are fixed, as many as a frame has, so that what does not depend on
 uncertain as its images leave it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,6 @@ class CovarianceProblem:
 
     model: pycolmap.Reconstruction  # without frames that have no pose
     problem: Any
-    costs: list[Any] = field(default_factory=list)  # which Ceres does not keep alive
 
     @classmethod
     def of(
@@ -93,16 +92,6 @@ class CovarianceProblem:
             model.tear_down()
         found = cls(model, adjuster.whole_problem(model))
         return found if found._fix_frame() else None
-
-    def add(self, cost: Any, blocks: list[Array]) -> None:
-        """Add a cost without a robust loss.
-
-        Args:
-            cost: Ceres' cost function.
-            blocks: The parameters that it takes.
-        """
-        self.costs.append(cost)
-        self.problem.add_residual_block(cost, None, blocks)
 
     def covariance(self, params: Any) -> pycolmap.BACovariance | None:
         """Return the covariance, in units in which keypoints have a variance of one.
@@ -129,7 +118,8 @@ class CovarianceProblem:
         sigma = PLANE_SIGMA * float(np.linalg.norm(second - first))
         self.problem.set_parameter_block_constant(first)
         self.problem.set_parameter_block_constant(second)
-        self.add(PlaneCost(third, normal / np.linalg.norm(normal), sigma), [third])
+        plane = PlaneCost(third, normal / np.linalg.norm(normal), sigma)
+        self.problem.add_residual_block(plane, None, [third])
         return True
 
     def _triangle(self) -> list[Array] | None:

@@ -91,7 +91,7 @@ class _FocalTrials:
         if sigmas is None:
             return {}
         found = dict[int, float]()
-        for key, sigma in sigmas.own.items():
+        for key, sigma in sigmas.items():
             found[key] = self._growth_of(sigma)
         return found
 
@@ -207,6 +207,8 @@ def fitting_focals(
     gain = given_cost - free.adjust(free_model, FINAL)
     if gain * weight >= len(given) * per_parameter:
         return _moved_focals(free_model, priors, given)
+    if len(given) == 1:
+        return {}
     # What is wrong in the same way everywhere is one parameter.
     common_model = with_fewer_points(model)
     gain = given_cost - adjust_common_factor(common_model, free, sorted(given))

@@ -1,4 +1,4 @@
-"""How uncertain the focal lengths of a model are, each and all together.
+"""How uncertain the focal lengths of a model are, and whether all fit better by one factor.
 
 The joint covariance (:mod:`colmap_affrect.mappers.covariance`) has what poses, points, principal
 points and all other focal lengths leave open. So it has what no trial of one camera finds: all
@@ -7,7 +7,6 @@ focal lengths of some prints may grow at once.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pyceres
@@ -18,74 +17,9 @@ from colmap_affrect.mappers.adjustment import FINAL, Adjuster, solver_options
 from colmap_affrect.mappers.camera_priors import MIN_FOCAL_PX
 from colmap_affrect.mappers.covariance import ALL, CovarianceProblem
 
-TIE_SIGMA = 1e-4
-"""By which the mean of the logarithms of the focal lengths may differ from the unknown that is
-added for it: far less than any focal length is known to; numeric."""
-
 COMMON_SIGMA = 1e-3
 """By which logarithms of focal lengths that grow together may differ: less than any is known to,
 and enough for the solver to move them; numeric."""
-
-
-@dataclass(frozen=True)
-class FocalSigmas:
-    """Standard deviations of the logarithms of focal lengths."""
-
-    own: dict[int, float]  # by camera id
-    mean: float  # of the mean of all: how far they may grow together
-
-
-class MeanFocalCost(pyceres.CostFunction):  # type: ignore[misc]
-    """Ties an unknown to the mean of the logarithms of some focal lengths.
-
-    The covariance of that unknown is the variance of the mean. COLMAP does not tell it otherwise:
-    it has no covariances of two cameras.
-    """
-
-    def __init__(self, cameras: Sequence[pycolmap.Camera], sigma: float) -> None:
-        """Begin.
-
-        Args:
-            cameras: Whose parameters are the first blocks; the unknown is the last one.
-            sigma: By which it may differ from the mean, in units of the residuals of the problem.
-        """
-        super().__init__()
-        self.focals = [list(camera.focal_length_idxs()) for camera in cameras]
-        self.weight = 1.0 / sigma
-        self.set_num_residuals(1)
-        sizes = [len(camera.params) for camera in cameras]
-        self.set_parameter_block_sizes([*sizes, 1])
-
-    def Evaluate(
-        self, parameters: list[Array], residuals: Array, jacobians: list[Array] | None
-    ) -> bool:
-        """Compute the residual; see Ceres' CostFunction.
-
-        Args:
-            parameters: The blocks.
-            residuals: Of one number, changed in place.
-            jacobians: One for each block, changed in place; None where none is wanted.
-
-        Returns:
-            Whether that was possible.
-        """
-        number = len(self.focals)
-        mean = 0.0
-        for params, focal in zip(parameters[:-1], self.focals, strict=True):
-            focals_px = np.maximum(params[focal], MIN_FOCAL_PX)
-            mean += float(np.mean(np.log(focals_px))) / number
-        residuals[0] = self.weight * (mean - parameters[-1][0])
-        if jacobians is None:
-            return True
-        for index, focal in enumerate(self.focals):
-            if jacobians[index] is not None:
-                focals_px = np.maximum(parameters[index][focal], MIN_FOCAL_PX)
-                slopes = np.zeros(len(parameters[index]))
-                slopes[focal] = self.weight / (number * len(focal) * focals_px)
-                jacobians[index][:] = slopes
-        if jacobians[-1] is not None:
-            jacobians[-1][:] = -self.weight
-        return True
 
 
 class CommonFactorCost(pyceres.CostFunction):  # type: ignore[misc]
@@ -148,12 +82,10 @@ def adjust_common_factor(
     """
     problem = adjuster.whole_problem(model)
     log_factor = np.zeros(1)
-    costs = []  # Ceres does not keep them alive
     for key in camera_ids:
         camera = model.cameras[key]
         if problem.has_parameter_block(camera.params):
             cost = CommonFactorCost(camera, COMMON_SIGMA / adjuster.noise_px)
-            costs.append(cost)
             problem.add_residual_block(cost, None, [camera.params, log_factor])
     summary = pyceres.SolverSummary()
     pyceres.solve(solver_options(FINAL, model.num_reg_images()), problem, summary)
@@ -165,7 +97,7 @@ def adjust_common_factor(
 
 def focal_sigmas(
     model: pycolmap.Reconstruction, adjuster: Adjuster, camera_ids: Sequence[int]
-) -> FocalSigmas | None:
+) -> dict[int, float] | None:
     """Return how uncertain focal lengths are while all else of a model may move.
 
     Args:
@@ -174,29 +106,18 @@ def focal_sigmas(
         camera_ids: Cameras whose focal lengths are refined, one at least.
 
     Returns:
-        The deviations, None where they cannot be computed.
+        The deviations of the logarithms of the focal lengths, by camera id; None where they cannot
+        be computed.
     """
     joint = CovarianceProblem.of(model, adjuster)
-    if joint is None:
+    covariance = joint.covariance(ALL) if joint else None
+    if joint is None or covariance is None:
         return None
-    cameras = [joint.model.cameras[key] for key in camera_ids]
-    blocks = [camera.params for camera in cameras]
-    if not all(map(joint.problem.has_parameter_block, blocks)):
-        return None
-    mean = np.zeros(1)
-    joint.add(MeanFocalCost(cameras, TIE_SIGMA / adjuster.noise_px), [*blocks, mean])
-    covariance = joint.covariance(ALL)
-    if covariance is None:
-        return None
-    own = dict[int, float]()
-    for key, camera in zip(camera_ids, cameras, strict=True):
-        own[key] = _log_focal_sigma(camera, covariance)
-    of_mean = covariance.get_other_params_cov(mean)
-    mean_sigma = math.inf if of_mean is None else math.sqrt(max(of_mean[0, 0], 0.0))
-    if not math.isfinite(mean_sigma + sum(own.values())):
-        return None
-    scaled = {key: adjuster.noise_px * sigma for key, sigma in own.items()}
-    return FocalSigmas(scaled, adjuster.noise_px * mean_sigma)
+    found = dict[int, float]()
+    for key in camera_ids:
+        sigma = _log_focal_sigma(joint.model.cameras[key], covariance)
+        found[key] = adjuster.noise_px * sigma
+    return found if all(map(math.isfinite, found.values())) else None
 
 
 def _log_focal_sigma(
