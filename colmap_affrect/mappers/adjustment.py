@@ -220,7 +220,7 @@ class Adjuster:
             fix_gauge=image_ids is None,
         )
         problem = self._problem(model, config, cameras - constant)
-        solver = _solver_options(max_iterations, len(images))
+        solver = solver_options(max_iterations, len(images))
         if early_stop:
             early_stop.noise_px = self.noise_px
             solver.callbacks = [early_stop]
@@ -231,17 +231,8 @@ class Adjuster:
             return math.inf
         return float(summary.final_cost) / self.noise_px**2
 
-    def pose_covariance(
-        self, model: pycolmap.Reconstruction
-    ) -> pycolmap.BACovariance | None:
-        """Return the covariance of the poses of a model that has been adjusted.
-
-        Three points are constant, which changes nothing of what does not depend on the frame of the
-        model, as relative directions. It is in units in which keypoints have a variance of one.
-
-        Returns:
-            The covariance, None where it cannot be computed.
-        """
+    def whole_problem(self, model: pycolmap.Reconstruction) -> Any:
+        """Return Ceres' problem of all images of a model, whose frame nothing fixes."""
         images = sorted(model.reg_image_ids())
         cameras = {model.images[image_id].camera_id for image_id in images}
         config = self._config(
@@ -250,11 +241,7 @@ class Adjuster:
             constant_cameras=cameras & self.constant,
             fix_gauge=False,
         )
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-        problem = self._problem(model, config, cameras - self.constant)
-        wanted = pycolmap.BACovarianceOptions()
-        wanted.params = pycolmap.BACovarianceOptionsParams.POSES
-        return pycolmap.estimate_ba_covariance_from_problem(wanted, model, problem)
+        return self._problem(model, config, cameras - self.constant)
 
     def _problem(
         self,
@@ -375,7 +362,8 @@ class Adjuster:
         )
 
 
-def _solver_options(max_iterations: int, num_images: int) -> Any:
+def solver_options(max_iterations: int, num_images: int) -> Any:
+    """Return Ceres' options for an adjustment of so many images."""
     options = pyceres.SolverOptions()
     options.max_num_iterations = max_iterations
     options.num_threads = 1

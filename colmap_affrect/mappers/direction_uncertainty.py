@@ -2,8 +2,7 @@
 
 Photographs that were taken from nearly one place have relative positions that noise decides, and
 where their focal lengths are not known an error of these moves them along their axes. The
-covariance of the bundle adjustment, with its priors of intrinsics, tells how far (Triggs et al.,
-Bundle adjustment - a modern synthesis, 2000, Sec. 9).
+joint covariance (:mod:`colmap_affrect.mappers.covariance`) tells how far.
 """
 
 import itertools
@@ -14,6 +13,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.adjustment import Adjuster
+from colmap_affrect.mappers.covariance import POSES, CovarianceProblem
 
 MAX_COVARIANCE_IMAGES = 100
 """Larger models are not looked at: the time grows with the cube of the images, and half of so many
@@ -43,14 +43,9 @@ def direction_sigmas_deg(
     # A limit of time, other than that of focal_observability
     if not 3 <= len(image_ids) <= MAX_COVARIANCE_IMAGES:
         return {}
-    if not all(model.images[image_id].is_ref_in_frame() for image_id in image_ids):
-        return {}  # COLMAP has no covariances of rigs
-    if model.num_frames() > model.num_reg_frames():
-        # COLMAP looks for covariances of all frames, also of those without a pose.
-        model = pycolmap.Reconstruction(model)
-        model.tear_down()
-    covariance = adjuster.pose_covariance(model)
-    if covariance is None:
+    problem = CovarianceProblem.of(model, adjuster)
+    covariance = problem.covariance(POSES) if problem else None
+    if problem is None or covariance is None:
         return {}
     num_needed = math.ceil((len(image_ids) - 1) / 2)
     found = dict[int, float]()
@@ -94,6 +89,8 @@ def _direction_sigma_deg(
     if own is None or others is None or common is None:
         return math.inf
     joint = np.block([[own, common], [np.transpose(common), others]])
+    if not np.isfinite(joint).all():
+        return math.inf
     first_pose = model.images[first].cam_from_world()
     second_pose = model.images[second].cam_from_world()
     rotation: Array = first_pose.rotation.matrix() @ second_pose.rotation.matrix().T

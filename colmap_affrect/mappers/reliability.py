@@ -204,8 +204,7 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
     """Return the probability that a pose is right, and what takes most from it."""
     coefficients = _coefficients()
     log_odds = coefficients.constant + features.tie_point_log_odds
-    odds_of_two_scenes = _odds_of_two_scenes(features)
-    factor = _precision_factor(features)
+    factor = unfitted_factor(features)
     losses = _other_losses(features)
     mendable = 0.0
     for name, fitted in coefficients.terms.items():
@@ -217,15 +216,24 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) * factor / (1.0 + odds_of_two_scenes)
-    with_matches = _probability(log_odds + mendable) * factor
+    probability = _probability(log_odds) * factor
+    precision_factor = _precision_factor(features)
+    with_matches = _probability(log_odds + mendable) * precision_factor
     gain = with_matches - probability
     return Confidence(
         probability=probability,
         reasons=_main_reasons(losses),
         gain=gain,
-        precision_factor=factor,
+        precision_factor=precision_factor,
     )
+
+
+def unfitted_factor(features: ReliabilityFeatures) -> float:
+    """Return the factor of the probability by what the regression is not fitted to.
+
+    That is the pair which a photograph hangs on, and what noise leaves open.
+    """
+    return _precision_factor(features) / (1.0 + _odds_of_two_scenes(features))
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:

@@ -5,51 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from seen_by_all import FAR, NEAR, adjuster, model_of
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers import direction_uncertainty
-from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
-from colmap_affrect.mappers.camera_priors import CameraPrior
+from colmap_affrect.mappers import covariance, direction_uncertainty
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX
 from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
-
-FOCAL_PX = 1200.0
-FAR = ((0.0, 0.0, 0.0), (4.0, 0.5, 0.3), (-3.0, 1.0, 0.5), (1.0, -3.0, 0.2))
-NEAR = ((0.0, 0.0, 0.0), (0.05, 0.02, 0.1), (-0.04, 0.06, 0.05), (4.0, 0.5, 0.3))
-"""Three of them stand at one place, seen from 12 away."""
-
-
-def model_of(
-    centers: tuple[tuple[float, float, float], ...],
-    noise_px: float = 0.0,
-    seed: int = 0,
-) -> pycolmap.Reconstruction:
-    """Points that all images see, with noise on their keypoints; no camera is turned."""
-    random = np.random.default_rng(5)
-    points = random.uniform((-4, -3, 9), (4, 3, 15), (120, 3))
-    noise = np.random.default_rng(seed)
-    model = pycolmap.Reconstruction()
-    tracks = [pycolmap.Track() for _ in points]
-    for number, center in enumerate(centers, 1):
-        camera = pycolmap.Camera.create_from_model_name(
-            number, "SIMPLE_RADIAL", FOCAL_PX, 1600, 1200
-        )
-        model.add_camera_with_trivial_rig(camera)
-        rays = points - center
-        pixels = FOCAL_PX * rays[:, :2] / rays[:, 2:] + (800.0, 600.0)
-        pixels += noise_px * noise.normal(size=pixels.shape)
-        image = pycolmap.Image(f"{number}.jpg", pixels, number, number)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), -np.array(center))
-        model.add_image_with_trivial_frame(image, pose)
-        for index, track in enumerate(tracks):
-            track.add_element(number, index)
-    for point, track in zip(points, tracks, strict=True):
-        model.add_point3D(point, track, np.zeros(3, np.uint8))
-    return model
-
-
-def adjuster(focal_sigma: float) -> Adjuster:
-    priors = {key: CameraPrior(FOCAL_PX, focal_sigma) for key in range(1, 5)}
-    return Adjuster(priors, NOISE_PX, pycolmap.BundleAdjustmentOptions())
 
 
 def direction(
@@ -125,3 +86,19 @@ def test_two_images_and_very_many_are_not_looked_at(
     assert not direction_sigmas_deg(model_of(FAR[:2]), adjuster(0.3))
     monkeypatch.setattr(direction_uncertainty, "MAX_COVARIANCE_IMAGES", 3)
     assert not direction_sigmas_deg(model_of(FAR), adjuster(0.3))
+
+
+def test_it_does_not_depend_on_the_points_that_fix_the_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = model_of(NEAR)
+    before = direction_sigmas_deg(model, adjuster(0.3))
+    monkeypatch.setattr(covariance, "NUM_FRAME_POINTS", 3)
+    assert direction_sigmas_deg(model, adjuster(0.3)) == pytest.approx(before, rel=1e-3)
+
+
+def test_of_points_on_a_line_nothing_is_said() -> None:
+    model = model_of(FAR)
+    for index, point_id in enumerate(sorted(model.point3D_ids())):
+        model.points3D[point_id].xyz = np.array([0.0, 0.1 * index, 12.0])
+    assert not direction_sigmas_deg(model, adjuster(0.3))
