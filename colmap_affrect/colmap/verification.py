@@ -480,15 +480,34 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
 def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
 ) -> list[set[T]]:
-    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
-    import networkx  # which takes as long to load as numpy and OpenCV together
+    """Return the images that pairs connect, largest part first; of ``images`` also lone ones.
 
-    graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
-    return sorted(
-        networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
-    )
+    All mapping asks for that: networkx takes as long to load as numpy and OpenCV together.
+    """
+    partners: dict[T, list[T]] = {image: [] for image in images}
+    for first, second in pairs:
+        partners.setdefault(first, []).append(second)
+        partners.setdefault(second, []).append(first)
+    parts = list[set[T]]()
+    seen = set[T]()
+    for image in partners:
+        if image not in seen:
+            part = _reached_from(image, partners)
+            seen |= part
+            parts.append(part)
+    return sorted(parts, key=lambda part: (-len(part), min(part)))
+
+
+def _reached_from(image: T, partners: Mapping[T, Iterable[T]]) -> set[T]:
+    """Return an image, and all that its partners lead to."""
+    found = {image}
+    todo = [image]
+    while todo:
+        for other in partners[todo.pop()]:
+            if other not in found:
+                found.add(other)
+                todo.append(other)
+    return found
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
