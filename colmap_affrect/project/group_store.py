@@ -110,6 +110,11 @@ def read_checked(group: h5py.Group, name: str) -> NDArray[Any]:
     return values
 
 
+def num_rows(group: h5py.Group, name: str) -> int:
+    """Return the length of a dataset, without reading it."""
+    return int(h5py.h5d.open(group.id, name.encode()).shape[0])
+
+
 def _checksum(values: Any) -> int:
     return zlib.crc32(np.ascontiguousarray(values).data)
 
