@@ -484,30 +484,16 @@ def connected_parts(
 
     All mapping asks for that: networkx takes as long to load as numpy and OpenCV together.
     """
-    partners: dict[T, list[T]] = {image: [] for image in images}
+    part_of: dict[T, set[T]] = {image: {image} for image in images}
     for first, second in pairs:
-        partners.setdefault(first, []).append(second)
-        partners.setdefault(second, []).append(first)
-    parts = list[set[T]]()
-    seen = set[T]()
-    for image in partners:
-        if image not in seen:
-            part = _reached_from(image, partners)
-            seen |= part
-            parts.append(part)
-    return sorted(parts, key=lambda part: (-len(part), min(part)))
-
-
-def _reached_from(image: T, partners: Mapping[T, Iterable[T]]) -> set[T]:
-    """Return an image, and all that its partners lead to."""
-    found = {image}
-    todo = [image]
-    while todo:
-        for other in partners[todo.pop()]:
-            if other not in found:
-                found.add(other)
-                todo.append(other)
-    return found
+        part = part_of.setdefault(first, {first})
+        other = part_of.setdefault(second, {second})
+        if part is not other:
+            smaller, larger = sorted((part, other), key=len)
+            larger.update(smaller)
+            part_of.update(dict.fromkeys(smaller, larger))
+    parts = {id(part): part for part in part_of.values()}
+    return sorted(parts.values(), key=lambda part: (-len(part), min(part)))
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
