@@ -480,15 +480,20 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
 def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
 ) -> list[set[T]]:
-    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
-    import networkx  # which takes as long to load as numpy and OpenCV together
+    """Return the images that pairs connect, largest part first; of ``images`` also lone ones.
 
-    graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
-    return sorted(
-        networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
-    )
+    All mapping asks for that: networkx takes as long to load as numpy and OpenCV together.
+    """
+    part_of: dict[T, set[T]] = {image: {image} for image in images}
+    for first, second in pairs:
+        part = part_of.setdefault(first, {first})
+        other = part_of.setdefault(second, {second})
+        if part is not other:
+            smaller, larger = sorted((part, other), key=len)
+            larger.update(smaller)
+            part_of.update(dict.fromkeys(smaller, larger))
+    parts = {id(part): part for part in part_of.values()}
+    return sorted(parts.values(), key=lambda part: (-len(part), min(part)))
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:

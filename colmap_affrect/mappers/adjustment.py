@@ -45,6 +45,35 @@ FIRST_STEPS = 3  # of an adjustment, which say nothing of those that follow
 # Part of the excess over the other cost, below which a step is small; measured
 SMALL_STEP = 0.001
 NUM_SMALL = 3  # small steps in a row that end an adjustment; measured
+SMALL_CHANGE = 0.01
+"""Nats that a small step lowers a cost by which is only compared: hundreds of them are needed for a
+gain that counts (model_score.MIN_SCORE_GAIN; theory)."""
+
+
+class CostStop(pyceres.IterationCallback):  # type: ignore[misc]
+    """Ends an adjustment whose cost, or score, is all that is asked for.
+
+    That is so once some steps in a row lower the cost by next to nothing. Those that are left only
+    let single outliers go.
+    """
+
+    def __init__(self) -> None:
+        """Begin; one adjustment has one."""
+        super().__init__()
+        self.noise_px = 1.0  # scale of the solver's costs; the adjuster sets it
+        self._num_small = 0  # small steps in a row
+
+    def __call__(self, step: Any) -> Any:
+        """See Ceres' IterationCallback."""
+        if step.iteration == 0 or not step.step_is_successful:
+            return pyceres.CallbackReturnType.SOLVER_CONTINUE
+        if step.cost_change <= SMALL_CHANGE * self.noise_px**2:
+            self._num_small += 1
+        else:
+            self._num_small = 0
+        if self._num_small >= NUM_SMALL:
+            return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+        return pyceres.CallbackReturnType.SOLVER_CONTINUE
 
 
 class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
@@ -160,6 +189,8 @@ class Adjuster:
     tie_points: TiePoints = (
         NO_TIE_POINTS  # observed by all models that have two of their images
     )
+    # Of models only costs and scores are asked for, which single outliers do not decide
+    compares_only: bool = False
 
     def set_initial_focals(
         self, model: pycolmap.Reconstruction, used: Collection[int] = ()
@@ -221,9 +252,12 @@ class Adjuster:
         )
         problem = self._problem(model, config, cameras - constant)
         solver = solver_options(max_iterations, len(images))
-        if early_stop:
-            early_stop.noise_px = self.noise_px
-            solver.callbacks = [early_stop]
+        stop: CostStop | EarlyStop | None = early_stop
+        if self.compares_only and not stop:
+            stop = CostStop()
+        if stop:
+            stop.noise_px = self.noise_px
+            solver.callbacks = [stop]
         summary = pyceres.SolverSummary()
         pyceres.solve(solver, problem, summary)
         model.update_point_3d_errors()

@@ -133,6 +133,8 @@ class MappedModel:
     """By the names of images that were in the same model, why they are not in this one."""
     motion_share: float = 1.0
     """Share of what moves as the model says, before cameras were freed, which may hide the rest."""
+    one_place_by: PairGraph | None = None
+    """Pairs that tell that all its images are of one place, where somebody has looked."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
 

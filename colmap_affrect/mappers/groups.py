@@ -68,6 +68,8 @@ def with_places_mapped_again(
     while todo:
         mapped = todo.pop(0)
         places = places_of(mapped.reconstruction, graph)
+        if places.is_clearly_one:
+            mapped = replace(mapped, one_place_by=graph)
         made = _largest_place_alone(places, graph, map_again)
         found.append(made or mapped)
         inside.update(found[-1].reconstruction.reg_image_ids())

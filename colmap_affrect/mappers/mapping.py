@@ -43,7 +43,7 @@ from colmap_affrect.mappers.reliability import (
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
-from colmap_affrect.mappers.surroundings import apart, places_of
+from colmap_affrect.mappers.surroundings import apart, known_places
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
@@ -265,7 +265,7 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
         whole = _without_wrong_images(mapped, task)
         _doubt_motion(whole, task)
         return [whole]
-    places = places_of(mapped.reconstruction, graph)
+    places = known_places(mapped, graph)
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
     for name, doubt in mapped.apart.items():

@@ -214,9 +214,14 @@ class Search:
         as_it_is = with_fewer_points(model)
         straight = with_fewer_points(model)
         straighten(straight, self.adjuster.priors)
-        cost = self.adjuster.adjust(as_it_is, FINAL)
-        straight_cost = self.adjuster.adjust(straight, FINAL)
+        adjuster = self.comparing().adjuster
+        cost = adjuster.adjust(as_it_is, FINAL)
+        straight_cost = adjuster.adjust(straight, FINAL)
         return cost, straight_cost
+
+    def comparing(self) -> Self:
+        """Return a search for models that are only compared: adjustments end earlier."""
+        return replace(self, adjuster=replace(self.adjuster, compares_only=True))
 
     @cached_property
     def unknown(self) -> dict[int, CameraPrior]:

@@ -524,7 +524,7 @@ def _with_per_image_cameras(
     """
     thin = graph.thinned()
     if thin is not graph:
-        trial = per_image.grower(thin).restart_from(model)
+        trial = per_image.comparing().grower(thin).restart_from(model)
         per_image_score = replace(per_image.scorer, graph=thin).score(trial)
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if per_image_score <= shared_score + MIN_SCORE_GAIN:

@@ -187,11 +187,11 @@ class _Views:
         radius_px = SURFACE_RADIUS * max(camera.width, camera.height)
         across = points_px[:, :1] - own[:, 0]
         down = points_px[:, 1:] - own[:, 1]
-        distances = np.hypot(across, down)
-        nearest = np.argpartition(distances, NUM_NEIGHBORS - 1, axis=1)
+        squares = across * across + down * down
+        nearest = np.argpartition(squares, NUM_NEIGHBORS - 1, axis=1)
         nearest = nearest[:, :NUM_NEIGHBORS]
-        farthest = np.take_along_axis(distances, nearest, axis=1).max(axis=1)
-        is_known = farthest < radius_px
+        farthest = np.take_along_axis(squares, nearest, axis=1).max(axis=1)
+        is_known = farthest < radius_px * radius_px
         surfaces = np.median(own_depths[nearest], axis=1)
         return np.asarray(is_known & (depths > HIDDEN * surfaces))
 
@@ -234,6 +234,19 @@ class Places:
     """Images of two places: one region matches one of them, another one the other."""
     unclear: dict[int, float] = field(default_factory=dict)
     """Probability, by image, that it is of the place of others that it is taken for."""
+
+    @property
+    def is_clearly_one(self) -> bool:
+        """Whether nothing speaks for more than one place."""
+        return len(self.images) == 1 and not self.collages and not self.unclear
+
+
+def known_places(mapped: MappedModel, graph: PairGraph) -> Places:
+    """Return the places that a model holds, and look at it only if nobody has."""
+    model = mapped.reconstruction
+    if mapped.one_place_by is graph:
+        return Places([set(model.reg_image_ids())])
+    return places_of(model, graph)
 
 
 def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:

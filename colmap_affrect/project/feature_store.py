@@ -26,6 +26,7 @@ from colmap_affrect.project.group_store import (
     GroupStore,
     entries_of,
     has_entry,
+    num_rows,
     read_checked,
 )
 from colmap_affrect.project.line_report import (
@@ -48,7 +49,7 @@ def _entries_of(path: Path, _: str) -> Entries:
     with FeatureStore(path)._open("r") as file:
         for name, group in entries_of(file):
             width, height = read_checked(group, "image_size").tolist()
-            found[name] = _content(group), len(group["keypoints"]), (width, height)
+            found[name] = _content(group), num_rows(group, "keypoints"), (width, height)
     return dict(sorted(found.items()))
 
 
@@ -64,7 +65,7 @@ def _level_ends(group: h5py.Group) -> dict[int, int]:
 
 
 def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
-    return {key: read_checked(group, key) for key in LINE_DATASETS if key in group}
+    return {k: read_checked(group, k) for k in LINE_DATASETS if k.encode() in group.id}
 
 
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyceres
 import pytest
 from mapping_tasks import synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.mappers.adjustment import FINAL, Adjuster, IntrinsicsCost
+from colmap_affrect.mappers.adjustment import (
+    FINAL,
+    Adjuster,
+    CostStop,
+    IntrinsicsCost,
+)
 from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
     PrincipalPointPrior,
@@ -167,3 +174,38 @@ def test_distortion_that_images_cannot_tell_stays_as_it_is(
     held = replace(told, has_distortion=False)
     assert all(c.params[3] == 0.0 for c in deviations(straight, held).cameras.values())
     assert all(c.params[3] != 0.0 for c in deviations(straight, told).cameras.values())
+
+
+@pytest.mark.parametrize(("gain", "ends"), [(0.003, True), (0.05, False), (3.0, False)])
+def test_an_adjustment_that_is_compared_ends_where_steps_gain_next_to_nothing(
+    gain: float, *, ends: bool
+) -> None:
+    stop = CostStop()
+    stop.noise_px = 2.0
+    found = []
+    for iteration in range(6):
+        step = SimpleNamespace(
+            iteration=iteration,
+            step_is_successful=True,
+            cost_change=gain * 4.0,  # in squared px
+        )
+        found.append(stop(step))
+    kinds = pyceres.CallbackReturnType
+    ended = kinds.SOLVER_TERMINATE_SUCCESSFULLY in found
+    assert ended == ends
+    assert found[:3] == [kinds.SOLVER_CONTINUE] * 3
+
+
+def test_a_model_that_is_only_compared_has_the_cost_of_a_converged_one(
+    model: pycolmap.Reconstruction,
+) -> None:
+    priors = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, 0.1))
+    converging = Adjuster(priors, 0.5, pycolmap.BundleAdjustmentOptions())
+    comparing = replace(converging, compares_only=True)
+    costs = []
+    for adjuster in (converging, comparing):
+        trial = pycolmap.Reconstruction(model)
+        for camera in trial.cameras.values():
+            camera.params = [1.1 * camera.params[0], *camera.params[1:3], 0.0]
+        costs.append(adjuster.adjust(trial, FINAL))
+    assert costs[0] <= costs[1] < costs[0] + 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,12 @@ from colmap_affrect.mappers.groups import with_places_mapped_again
 from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
-from colmap_affrect.mappers.surroundings import Overlap, _merged, places_of
+from colmap_affrect.mappers.surroundings import (
+    Overlap,
+    _merged,
+    known_places,
+    places_of,
+)
 from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
@@ -242,6 +248,26 @@ def test_a_model_of_one_place_is_not_mapped_again(tmp_path: Path) -> None:
 
     found = with_places_mapped_again([whole], PairGraph.read(path), never)
     assert [mapped.reconstruction for mapped in found] == [whole.reconstruction]
+
+
+def test_a_model_that_is_known_to_be_of_one_place_is_looked_at_once(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    whole = MappedModel(scene(path, everything))
+    graph = PairGraph.read(path)
+
+    def never(_: PairGraph) -> list[MappedModel]:
+        raise AssertionError
+
+    (known,) = with_places_mapped_again([whole], graph, never)
+    of_places = MappedModel(scene(tmp_path / "other.db", poster))
+    assert known_places(known, graph).images == [{*HERE, *THERE}]
+    # What is known is not looked at again: by the poster there would be two places.
+    taken_for_known = replace(of_places, one_place_by=graph)
+    assert len(known_places(taken_for_known, graph).images) == 1
+    other_graph = PairGraph.read(tmp_path / "other.db")
+    assert len(known_places(taken_for_known, other_graph).images) == 2
 
 
 @pytest.mark.parametrize(
