@@ -6,7 +6,7 @@ from itertools import combinations
 
 import pytest
 
-from colmap_affrect.colmap.verification import lone_ties
+from colmap_affrect.colmap.connections import lone_ties
 
 Pairs = list[tuple[int, int]]
 
