@@ -339,6 +339,7 @@ def verify(
     output_path: PathLike,
     verification: VerificationOptions | Mapping[str, Any] | None = None,
     *,
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: GivenProgress = None,
 ) -> StageReport:
@@ -347,6 +348,7 @@ def verify(
     Args:
         output_path: folder that :func:`match` was given.
         verification: its options; None: as :func:`extract` was told.
+        executor: see :func:`run`.
         overwrite: discard the results of this and later stages.
         progress: see :func:`run`.
     """
@@ -354,7 +356,8 @@ def verify(
     chosen = None
     if verification is not None:
         chosen = VerificationOptions.given(verification, "verification")
-    with one_stage("verify", _context(output_path, progress)) as context:
+    context = _context(output_path, progress, executor=executor)
+    with one_stage("verify", context):
         return verify_pairs(context, chosen, overwrite=overwrite)
 
 
@@ -452,9 +455,7 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
         context.workspace.locked(),
         mend_and_seal(context, follows=False, discards=overwrite),
     ):
-        report = import_and_verify(
-            context, foreign, verification=chosen, overwrite=overwrite
-        )
+        report = import_and_verify(context, foreign, chosen, overwrite=overwrite)
         return map_and_report(
             context, mapper, extend=extension, earlier=[report], page=page
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.geometry.parallax import text_line_matches
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
-from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 
 Names = tuple[str, str]
 Frames = tuple[
@@ -306,11 +306,32 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
 
 @dataclass(frozen=True)
 class _Task:
-    """A pair to verify."""
+    """A pair to verify, with the keypoints of its matches alone: it may go to another machine."""
 
     image_ids: tuple[int, int]
-    sides: tuple[Side, Side]
-    matches: Matches  # raw
+    sides: tuple[Side, Side]  # keypoints of a row match
+    matches: Matches  # raw, numbers of the keypoints in the database
+    extracted_px: int | None
+
+    @classmethod
+    def of(
+        cls,
+        image_ids: tuple[int, int],
+        sides: tuple[Side, Side],
+        matches: Matches,
+        extracted_px: int | None,
+    ) -> Self:
+        """Keep of two images the keypoints that are matched.
+
+        Args:
+            image_ids: of the two images.
+            sides: with all of their keypoints.
+            matches: (M, 2) numbers of keypoints.
+            extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        """
+        matched1 = Side(sides[0].camera, sides[0].keypoints[matches[:, 0]])
+        matched2 = Side(sides[1].camera, sides[1].keypoints[matches[:, 1]])
+        return cls(image_ids, (matched1, matched2), matches, extracted_px)
 
 
 @dataclass(frozen=True)
@@ -319,6 +340,21 @@ class _Done:
 
     image_ids: tuple[int, int]
     geometry: pycolmap.TwoViewGeometry
+
+
+@dataclass(frozen=True)
+class _Estimator:
+    """Estimates the geometries of pairs, in a thread of this process or on a worker."""
+
+    options: VerificationOptions
+
+    def __call__(self, task: _Task) -> _Done:
+        """Return the geometry of a pair; its inliers are raw matches."""
+        rows = _twice(np.arange(len(task.matches), dtype=np.uint32))
+        geometry = estimate_geometry(task.sides, rows, self.options, task.extracted_px)
+        inliers = np.asarray(geometry.inlier_matches)[:, 0]
+        geometry.inlier_matches = task.matches.astype(np.uint32)[inliers]
+        return _Done(task.image_ids, geometry)
 
 
 def verify(
@@ -352,6 +388,7 @@ def verify_pairs(
     options: VerificationOptions,
     extracted_px: ExtractedPx = None,
     advance: Callable[[int], None] | None = None,
+    executor: Executor | None = None,
 ) -> None:
     """Estimate the two-view geometries of matched pairs.
 
@@ -364,7 +401,9 @@ def verify_pairs(
         options: of verification.
         extracted_px: longest side that photographs were shrunk to before extraction.
         advance: is called with the number of pairs that are done.
+        executor: where pairs are verified, e.g. a cluster; None: threads here.
     """
+    executor = executor or Threads(available_cores())
     cameras = colmap_database.cameras_of_images(database)
 
     @lru_cache(NUM_CACHED_IMAGES)
@@ -376,14 +415,11 @@ def verify_pairs(
         for image_id1, image_id2 in pairs:
             sides = (side(image_id1), side(image_id2))
             matches = _each_once(database.read_matches(image_id1, image_id2))
-            yield _Task((image_id1, image_id2), sides, matches)
+            image_ids = (int(image_id1), int(image_id2))
+            size_px = of_pair(extracted_px, image_ids)
+            yield _Task.of(image_ids, sides, matches, size_px)
 
-    def estimate(task: _Task) -> _Done:
-        size_px = of_pair(extracted_px, task.image_ids)
-        geometry = estimate_geometry(task.sides, task.matches, options, size_px)
-        return _Done(task.image_ids, geometry)
-
-    found = map_ordered(estimate, tasks(), available_cores())
+    found = executor.map(_Estimator(options), tasks())
     batch = list(islice(found, PAIRS_PER_WRITE))
     while batch:
         with pycolmap.DatabaseTransaction(database):
