@@ -38,7 +38,8 @@ CHUNK_ELEMENTS = 1 << 22  # cosines held at once, which bounds memory; resource
 CHUNK_ENTRIES = 1 << 11
 NO_LIMIT = 2.0  # of ratios, which are at most 1; theory
 # Of the features of image 1, the strongest, by which a pair may be given up. Of 571 verified pairs
-# of fourteen scenes one has no consistent match among theirs, of 425 others 229; measured
+# of fourteen scenes one, a wrong one, has no consistent match among theirs, of 425 others 229 have
+# none; measured
 SHARE_LOOKED_AT = 0.5
 # Matches of these features; with more, a pair has something in common; resource
 MAX_NUM_LOOKED_AT = 300
@@ -70,10 +71,9 @@ class MatchableImage:
     descriptors: Singles  # (N, D) float32 rows of unit length
     keypoints: Floats  # (N, 2) pixel-centre px
     rivals: NeighborLists  # for each feature those too near to be its second neighbour
-    strongest: (
-        Indices  # rising; of the features by which a pair may be given up, or all
-    )
-    others: Indices  # rising
+    # Features by which a pair may be given up, or all, and the others; both rising
+    strongest: Indices
+    others: Indices
     # (N, 2, 3) in pixel-centre px; None where they do not tell, or no pair is given up
     frames: Floats | None = None
     coarse: nearest_8bit.CoarseDescriptors | None = None  # the descriptors in 8 bits
