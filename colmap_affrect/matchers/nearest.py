@@ -263,14 +263,14 @@ def _nearest_of_listed(
 
 def _first_of_runs(rising: Indices) -> Indices:
     """Return where each value of (E,) rising ones comes first."""
-    return np.flatnonzero(np.diff(rising, prepend=-1))
+    return np.asarray(np.flatnonzero(np.diff(rising, prepend=-1)))
 
 
 def _positions_in(rising: Indices, wanted: Indices) -> Indices:
     """Return the positions, among (E,) rising values, of the wanted ones that are there."""
     positions = np.searchsorted(rising, wanted)
     positions = np.minimum(positions, len(rising) - 1)
-    return positions[rising[positions] == wanted]
+    return np.asarray(positions[rising[positions] == wanted])
 
 
 def _listed_cosines(
