@@ -99,8 +99,8 @@ FLAGS: dict[str, Settings] = {
     "--weights": _path("FOLDER", "weights of networks, looked for here first (then in "
         "$COLMAP_AFFRECT_WEIGHTS, torch's cache, installed packages; then downloaded)"),
     "--device": _value("DEVICE", "for networks: auto, cpu, cuda, cuda:1, mps (default: auto)"),
-    "--scheduler": _value("ADDRESS", "extract and match on the dask.distributed cluster of this "
-        "scheduler, such as tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); "
+    "--scheduler": _value("ADDRESS", "extract, match and verify on the dask.distributed cluster "
+        "of this scheduler, such as tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); "
         "default: on this machine"),
     # photographs, masks and cameras
     "--image-path": _path("PATH", "folder of the photographs, searched with its sub-folders, "

@@ -249,7 +249,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
         f"{RESULTS} {IMAGES} {RECIPE} --depth-path --database-descriptors {NETWORKS} --scheduler"),
     "pairs": ("which images to match, into pairs.txt", f"{RESULTS} {PAIRS}"),
     "match": ("matches into matches.h5 and database.db", f"{RESULTS} --set {NETWORKS} --scheduler"),
-    "verify": ("two-view geometries into database.db", f"{RESULTS} --preset --random-seed"),
+    "verify": ("two-view geometries into database.db",
+        f"{RESULTS} --preset --random-seed --scheduler"),
     "map": ("COLMAP models into sparse/",
         f"{RESULTS} --from-database@map --image-path@map {GIVEN_MATCHES} {KNOWN_CAMERAS} {MAPPER} "
         f"{MODEL}"),

@@ -1,12 +1,11 @@
 """Geometric verification of raw matches by pycolmap, and its significance."""
 
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,8 @@ from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.geometry.parallax import text_line_matches
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
-from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 
-T = TypeVar("T", int, str)
 Names = tuple[str, str]
 Frames = tuple[
     Floats, Floats
@@ -308,11 +306,32 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
 
 @dataclass(frozen=True)
 class _Task:
-    """A pair to verify."""
+    """A pair to verify, with the keypoints of its matches alone: it may go to another machine."""
 
     image_ids: tuple[int, int]
-    sides: tuple[Side, Side]
-    matches: Matches  # raw
+    sides: tuple[Side, Side]  # keypoints of a row match
+    matches: Matches  # raw, numbers of the keypoints in the database
+    extracted_px: int | None
+
+    @classmethod
+    def of(
+        cls,
+        image_ids: tuple[int, int],
+        sides: tuple[Side, Side],
+        matches: Matches,
+        extracted_px: int | None,
+    ) -> Self:
+        """Keep of two images the keypoints that are matched.
+
+        Args:
+            image_ids: of the two images.
+            sides: with all of their keypoints.
+            matches: (M, 2) numbers of keypoints.
+            extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        """
+        matched1 = Side(sides[0].camera, sides[0].keypoints[matches[:, 0]])
+        matched2 = Side(sides[1].camera, sides[1].keypoints[matches[:, 1]])
+        return cls(image_ids, (matched1, matched2), matches, extracted_px)
 
 
 @dataclass(frozen=True)
@@ -321,6 +340,21 @@ class _Done:
 
     image_ids: tuple[int, int]
     geometry: pycolmap.TwoViewGeometry
+
+
+@dataclass(frozen=True)
+class _Estimator:
+    """Estimates the geometries of pairs, in a thread of this process or on a worker."""
+
+    options: VerificationOptions
+
+    def __call__(self, task: _Task) -> _Done:
+        """Return the geometry of a pair; its inliers are raw matches."""
+        rows = _twice(np.arange(len(task.matches), dtype=np.uint32))
+        geometry = estimate_geometry(task.sides, rows, self.options, task.extracted_px)
+        inliers = np.asarray(geometry.inlier_matches)[:, 0]
+        geometry.inlier_matches = task.matches.astype(np.uint32)[inliers]
+        return _Done(task.image_ids, geometry)
 
 
 def verify(
@@ -354,6 +388,7 @@ def verify_pairs(
     options: VerificationOptions,
     extracted_px: ExtractedPx = None,
     advance: Callable[[int], None] | None = None,
+    executor: Executor | None = None,
 ) -> None:
     """Estimate the two-view geometries of matched pairs.
 
@@ -366,7 +401,9 @@ def verify_pairs(
         options: of verification.
         extracted_px: longest side that photographs were shrunk to before extraction.
         advance: is called with the number of pairs that are done.
+        executor: where pairs are verified, e.g. a cluster; None: threads here.
     """
+    executor = executor or Threads(available_cores())
     cameras = colmap_database.cameras_of_images(database)
 
     @lru_cache(NUM_CACHED_IMAGES)
@@ -378,14 +415,11 @@ def verify_pairs(
         for image_id1, image_id2 in pairs:
             sides = (side(image_id1), side(image_id2))
             matches = _each_once(database.read_matches(image_id1, image_id2))
-            yield _Task((image_id1, image_id2), sides, matches)
+            image_ids = (int(image_id1), int(image_id2))
+            size_px = of_pair(extracted_px, image_ids)
+            yield _Task.of(image_ids, sides, matches, size_px)
 
-    def estimate(task: _Task) -> _Done:
-        size_px = of_pair(extracted_px, task.image_ids)
-        geometry = estimate_geometry(task.sides, task.matches, options, size_px)
-        return _Done(task.image_ids, geometry)
-
-    found = map_ordered(estimate, tasks(), available_cores())
+    found = executor.map(_Estimator(options), tasks())
     batch = list(islice(found, PAIRS_PER_WRITE))
     while batch:
         with pycolmap.DatabaseTransaction(database):
@@ -475,75 +509,3 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
         for pair_id, count in zip(pair_ids, counts, strict=True)
         if count >= min_num_inliers
     }
-
-
-def connected_parts(
-    pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
-) -> list[set[T]]:
-    """Return the images that pairs connect, largest part first; of ``images`` also lone ones.
-
-    All mapping asks for that: networkx takes as long to load as numpy and OpenCV together.
-    """
-    part_of: dict[T, set[T]] = {image: {image} for image in images}
-    for first, second in pairs:
-        part = part_of.setdefault(first, {first})
-        other = part_of.setdefault(second, {second})
-        if part is not other:
-            smaller, larger = sorted((part, other), key=len)
-            larger.update(smaller)
-            part_of.update(dict.fromkeys(smaller, larger))
-    parts = {id(part): part for part in part_of.values()}
-    return sorted(parts.values(), key=lambda part: (-len(part), min(part)))
-
-
-def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
-    """Return, smaller image first, the pairs that alone tie two parts of two images or more."""
-    listed = list(pairs)
-    partners = defaultdict[T, set[T]](set)
-    for first, second in listed:
-        partners[first].add(second)
-        partners[second].add(first)
-    if not any(
-        partners[first].isdisjoint(partners[second]) for first, second in listed
-    ):
-        return []  # a third image ties each pair, too
-    import networkx
-
-    graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_edges_from(listed)
-    return [
-        (min(first, second), max(first, second))
-        for first, second in networkx.bridges(graph)
-        if len(partners[first]) > 1 and len(partners[second]) > 1
-    ]
-
-
-def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
-    """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
-    images = sorted(set(chain.from_iterable(matches)))
-    number = {image: index for index, image in enumerate(images)}
-    ends = [np.zeros(0, np.int64)]  # features of first images, then of second ones
-    for side in (0, 1):
-        for pair, indices in matches.items():
-            ends.append((number[pair[side]] << 32) + indices[:, side])
-    features, index, num_matches = np.unique(
-        np.concatenate(ends), return_inverse=True, return_counts=True
-    )
-    first, second = index.reshape(2, -1)
-    is_shared = num_matches > 1
-    in_track = is_shared.copy()
-    in_track[first[is_shared[second]]] = True
-    in_track[second[is_shared[first]]] = True
-    counts = np.bincount(features[in_track] >> 32, minlength=len(images)).tolist()
-    return dict(zip(images, counts, strict=True))
-
-
-def weakly_connected_images(
-    matches: Mapping[tuple[str, str], Indices], min_num_features: int
-) -> set[str]:
-    """Return the images with fewer features than that in tracks through three images or more.
-
-    Mappers register images by features that two others have triangulated already.
-    """
-    counts = num_in_tracks(matches)
-    return {name for name, count in counts.items() if count < min_num_features}

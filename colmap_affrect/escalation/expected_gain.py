@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Worth
 from colmap_affrect.recipes import Level

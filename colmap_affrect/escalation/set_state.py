@@ -6,7 +6,7 @@ It is read anew for every decision, from the stores and the view graph: each ste
 import math
 from collections.abc import Collection, Mapping, Sequence
 
-from colmap_affrect.colmap.verification import weakly_connected_images
+from colmap_affrect.colmap.connections import weakly_connected_images
 from colmap_affrect.escalation.expected_gain import PairState, insecure_images
 from colmap_affrect.escalation.policy import Situation
 from colmap_affrect.mappers.mapping import read_summaries

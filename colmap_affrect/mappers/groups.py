@@ -7,7 +7,7 @@ group of photographs never does.
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search

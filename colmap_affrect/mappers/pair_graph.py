@@ -13,6 +13,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.colmap.two_views import (
@@ -20,7 +21,6 @@ from colmap_affrect.colmap.two_views import (
     decomposed_homography,
     homography_matrix,
 )
-from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.parallax import Size

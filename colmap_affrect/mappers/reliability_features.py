@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.connections import connected_parts, lone_ties
 from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.colmap.verification import connected_parts, lone_ties
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.parallax import correlation, same_view_homography
 from colmap_affrect.images.reading import read_gray

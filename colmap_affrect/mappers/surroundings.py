@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.geometry.arrays import Array, Bools, Indices
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.model_score import (

@@ -43,6 +43,8 @@ class MatcherContext(NetworkContext):
     device: str = "auto"  # as given by the user
     # About how many pairs of features will be compared in all
     num_comparisons: float = 0.0
+    # Pairs may be given up that some of their features show to have nothing in common
+    may_give_up: bool = False
 
 
 @dataclass(frozen=True)

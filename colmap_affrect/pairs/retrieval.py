@@ -7,6 +7,7 @@ roots (Arandjelovic and Zisserman 2013), less what all images have in common.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -24,6 +25,9 @@ NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from; resource
 NUM_ITERATIONS = 10  # resource
 # Compared with as many others at a time, which bounds memory; resource
 VECTORS_AT_ONCE = 512
+# Parts of as many vectors that are kept when they are centered, 64 MiB each: enough for those of
+# 2,048 images; resource
+NUM_CENTERED_PARTS = 4
 
 
 def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:
@@ -68,6 +72,7 @@ def similarities(vectors: NDArray[np.float16]) -> Iterator[Singles]:
     mean = vectors.mean(axis=0, dtype=np.float32)
     begins = range(0, len(vectors), VECTORS_AT_ONCE)
 
+    @lru_cache(NUM_CENTERED_PARTS)
     def centered(begin: int) -> Singles:
         return _unit_rows(vectors[begin : begin + VECTORS_AT_ONCE] - mean)
 

@@ -44,6 +44,7 @@ PACKAGES = (
     "colmap-affrect",
     "distributed",
     "numpy",
+    "pycolmap",
     "opencv-python-headless",
     "torch",
     "kornia",

@@ -144,6 +144,7 @@ def verify(
     output_path: PathLike,
     verification: VerificationOptions | Mapping[str, Any] | None = None,
     *,
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: GivenProgress = None,
 ) -> StageReport:
@@ -152,6 +153,7 @@ def verify(
     Args:
         output_path: folder that :func:`match` was given.
         verification: its options; None: as :func:`extract` was told.
+        executor: see :func:`run`.
         overwrite: discard the results of this and later stages.
         progress: see :func:`run`.
     """
@@ -159,7 +161,8 @@ def verify(
     chosen = None
     if verification is not None:
         chosen = VerificationOptions.given(verification, "verification")
-    with one_stage("verify", context_of(output_path, progress)) as context:
+    context = context_of(output_path, progress, executor=executor)
+    with one_stage("verify", context):
         return verify_pairs(context, chosen, overwrite=overwrite)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import zip_longest
 
-from colmap_affrect.colmap.verification import lone_ties
+from colmap_affrect.colmap.connections import lone_ties
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport

@@ -62,6 +62,9 @@ MIN_GROWTH = 1.1
 # Pairs with many matches, beside which others of an image are matched by no more features: this
 # saves time; resource
 NUM_WELL_TIED = 3
+# Listed pairs from which on those are given up that show nothing in common: with fewer all are
+# matched in seconds, and each one counts more; resource
+MIN_PAIRS_TO_GIVE_UP = 100
 CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process; resource
 # Of a feature ready for matching, with descriptors of 128 and coarse ones; measured
 BYTES_PER_FEATURE = 870
@@ -139,15 +142,25 @@ def _match_missing(
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
         matches.update_state(listed="")
+    may_give_up = len(pairs) >= MIN_PAIRS_TO_GIVE_UP
     with context.progress.stage("match", len(missing), "pairs") as advance:
-        match_pairs(context, missing, options, advance, options.max_num_first)
+        match_pairs(
+            context,
+            missing,
+            options,
+            advance,
+            options.max_num_first,
+            may_give_up=may_give_up,
+        )
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
     with context.progress.stage(
         "match", len(wanted), "pairs", "all features"
     ) as advance:
-        left = _worth_all_features(context, wanted, options, digest)
+        left = _worth_all_features(
+            context, wanted, options, digest, may_give_up=may_give_up
+        )
         advance(len(wanted) - len(left))
-        match_pairs(context, left, options, advance)
+        match_pairs(context, left, options, advance, may_give_up=may_give_up)
     warned = list[StageWarning]()
     has_new = bool(pairs) and (bool(missing) or not finished)
     if has_new and options.filter_stationary_matches:
@@ -191,6 +204,8 @@ def match_pairs(
     options: MatcherOptions,
     advance: Callable[[int], None],
     max_num: int = 0,
+    *,
+    may_give_up: bool = False,
 ) -> None:
     """Match pairs by the features that every image has, and store what is found.
 
@@ -200,8 +215,12 @@ def match_pairs(
         options: of the matcher.
         advance: is called with the number of pairs that are done.
         max_num: features of each image that are matched, those of the largest responses; 0: all.
+        may_give_up: some features may show that a pair has nothing in common.
     """
-    with closing(matched_at_level(context, pairs, options, 0, max_num)) as found_pairs:
+    found = matched_at_level(
+        context, pairs, options, 0, max_num, may_give_up=may_give_up
+    )
+    with closing(found) as found_pairs:
         write_batches(found_pairs, context.matches.write, advance)
 
 
@@ -220,7 +239,12 @@ def not_well_tied(matches: MatchStore, pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _worth_all_features(
-    context: Context, pairs: Sequence[Pair], options: MatcherOptions, digest: str
+    context: Context,
+    pairs: Sequence[Pair],
+    options: MatcherOptions,
+    digest: str,
+    *,
+    may_give_up: bool,
 ) -> list[Pair]:
     """Return the pairs that are still to be matched by all features.
 
@@ -232,6 +256,7 @@ def _worth_all_features(
         pairs: of image names, that these tie not well.
         options: of the matcher.
         digest: of the list of all pairs, for which the answer is kept on record.
+        may_give_up: some features may show that a pair has nothing in common.
     """
     matches = context.matches
     known = matches.state.in_vain
@@ -239,7 +264,8 @@ def _worth_all_features(
     sample: Sequence[Pair] = []
     if not is_known and len(pairs) > NUM_TRIED:
         sample = pairs[:: math.ceil(len(pairs) / NUM_TRIED)]
-        with closing(matched_at_level(context, sample, options, 0)) as found:
+        matched = matched_at_level(context, sample, options, 0, may_give_up=may_give_up)
+        with closing(matched) as found:
             by_all = list(found)
         num_after = _sum_confirming(context.features, by_all)
         num_before = _sum_confirming(context.features, matches.read(sample))
@@ -302,6 +328,8 @@ def matched_at_level(
     options: MatcherOptions,
     level: int,
     max_num: int = 0,
+    *,
+    may_give_up: bool = False,
 ) -> Generator[PairMatches, None, None]:
     """Match by the features of a level, and leave out what never moves.
 
@@ -311,6 +339,7 @@ def matched_at_level(
         options: of the matcher, where the level has none of its own.
         level: number of the level in the recipe.
         max_num: features of each image that are matched, those of the largest responses; 0: all.
+        may_give_up: some features may show that a pair has nothing in common.
 
     Yields:
         The matches of each pair, in an order in which images are read seldom.
@@ -324,6 +353,7 @@ def matched_at_level(
         chosen.features.name,
         context.resources,
         max_num,
+        may_give_up=may_give_up,
     )
     stationary = StationaryFilter(context.features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
@@ -345,6 +375,7 @@ class Matching:
     extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int = 0  # of each image, those of the largest responses; 0: all
+    may_give_up: bool = False  # pairs that some features show to have nothing in common
     # About how many pairs of features there will be to compare
     num_comparisons: float = 0
     num_kept: int = USUAL_IMAGES_IN_MEMORY
@@ -421,7 +452,10 @@ class CachedMatcher:
         if sent is not None:
             require_same_files(self._weights, sent)
         context = MatcherContext(
-            self._weights, resources.device, matching.num_comparisons
+            self._weights,
+            resources.device,
+            matching.num_comparisons,
+            matching.may_give_up,
         )
         self.matcher = MATCHERS.make(options, context)
         self._images = lru_cache(matching.num_kept)(self._prepare)

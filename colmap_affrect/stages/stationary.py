@@ -7,7 +7,7 @@ same place, but not to the pixel: see :mod:`colmap_affrect.geometry.stationary`.
 """
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -236,20 +236,24 @@ class StationaryFilter:
 
     def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_Places"]:
         """Return the cells in which nothing moves, by size."""
-        numbers = {name: number for number, name in enumerate(self._sizes)}
+        numbers = dict[str, int]()
+        num_images = Counter[Size]()
+        for name, size in self._sizes.items():
+            numbers[name] = num_images[size]
+            num_images[size] += 1
         cells = NUM_CELLS, NUM_CELLS
         # By size and cell: numbers of pairs with a match, and with one that does not move; images.
         matched: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
         still: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
-        images: dict[Size, Mask] = defaultdict(
-            lambda: np.zeros((*cells, len(numbers)), bool)
-        )
+        images = dict[Size, Mask]()
         for found in self._matches.read(list(filter(self._common_size, pairs))):
             size = self._sizes[found.names[0]]
             are_still, first, _ = self._still(found.names, found.indices, size)
             matched[size] += _mask(first)
             unmoved = _mask(first[are_still])
             still[size] += unmoved
+            if size not in images:
+                images[size] = np.zeros((*cells, num_images[size]), bool)
             for name in found.names:
                 images[size][unmoved, numbers[name]] = True
         places = {}

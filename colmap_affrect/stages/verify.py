@@ -75,7 +75,14 @@ def update_verified(
             )
         progress = context.progress if shows else SILENT
         with progress.stage("verify", len(todo), "pairs") as advance:
-            verify_pairs(database, todo, context.verification, sizes_px, advance)
+            verify_pairs(
+                database,
+                todo,
+                context.verification,
+                sizes_px,
+                advance,
+                context.executor,
+            )
     return len(todo)
 
 

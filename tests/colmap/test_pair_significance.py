@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from colmap_affrect.colmap.database import (
     unverified_pairs,
     write_matches,
 )
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import (
     Side,
     VerificationOptions,
@@ -23,6 +27,7 @@ from colmap_affrect.colmap.verification import (
     two_view_options,
     verified_pairs,
     verify,
+    verify_pairs,
 )
 from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 from colmap_affrect.geometry.parallax import text_line_matches
@@ -242,6 +247,36 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     assert unverified_pairs(path).tolist() == [[3, 4]]
     verify(path, options)
     assert list(verified_pairs(path, 1)) == [(1, 2)]
+
+
+class Elsewhere:
+    """An executor that sends functions, tasks and results as a cluster does."""
+
+    def map(
+        self,
+        function: Callable[[Any], Any],
+        tasks: Iterable[Any],
+        files: Sequence[Path] = (),
+    ) -> Iterator[Any]:
+        assert not files
+        for task in tasks:
+            there = pickle.loads(pickle.dumps(function))
+            result = there(pickle.loads(pickle.dumps(task)))
+            yield pickle.loads(pickle.dumps(result))
+
+
+def test_verification_elsewhere_leaves_what_threads_here_leave(tmp_path: Path) -> None:
+    options = VerificationOptions(min_significance=5.0)
+    digests = []
+    for name, executor in (("here", None), ("elsewhere", Elsewhere())):
+        path = tmp_path / f"{name}.db"
+        write_pairs(path)
+        with open_database(path) as database:
+            todo = np.array([[1, 2], [3, 4]])
+            verify_pairs(database, todo, options, executor=executor)
+        assert list(verified_pairs(path, 1)) == [(1, 2)]
+        digests.append(rows_digest(path))
+    assert digests[0] == digests[1]
 
 
 def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:

@@ -14,12 +14,9 @@ from PIL import Image
 from results import database_content
 from verified import copy_of, verified
 
+from colmap_affrect.colmap.connections import weakly_connected_images
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    VerificationOptions,
-    weakly_connected_images,
-)
+from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.escalation import escalate as escalation
 from colmap_affrect.escalation.escalate import Escalation

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.escalation import expected_gain
 from colmap_affrect.escalation.expected_gain import (
     PairState,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -158,3 +160,94 @@ def test_match_features_rejects_the_same_descriptor_at_two_far_places() -> None:
     first = (descriptors, spread(60))
     second = (np.concatenate([descriptors, descriptors]), spread(120))
     assert run(first, second, NearestOptions()).indices.tolist() == []
+
+
+NUM_SHAPED = 400  # features of an image with shapes of their own
+
+
+def shaped_image(
+    seed: int, *, related_to: ImageFeatures | None = None
+) -> ImageFeatures:
+    """Features with shapes of their own, perhaps those of another image, turned and enlarged."""
+    rng = np.random.default_rng(seed)
+    if related_to is None:
+        lafs = np.empty((NUM_SHAPED, 2, 3))
+        lafs[:, :, :2] = 4.0 * np.eye(2) + rng.uniform(-1.5, 1.5, (NUM_SHAPED, 2, 2))
+        lafs[:, :, 2] = rng.uniform(0.0, 800.0, (NUM_SHAPED, 2))
+        descriptors = unit_rows(rng.random((NUM_SHAPED, 16)) + 1e-3)
+    else:
+        turn = np.array([[0.9, -1.0], [1.0, 0.9]])
+        lafs = turn @ related_to.features.lafs
+        descriptors = related_to.features.descriptors
+    responses = rng.permutation(np.arange(1, NUM_SHAPED + 1)).astype(np.float32)
+    features = LocalFeatures(lafs, responses, descriptors)
+    return ImageFeatures(features, (800, 800), "")
+
+
+def matched_rows(
+    first: ImageFeatures, second: ImageFeatures, *, may_give_up: bool
+) -> list[list[int]]:
+    options = NearestOptions(max_ratio=1.0, min_contrast_distance_px=1.0)
+    context = MatcherContext({}, "cpu", may_give_up=may_give_up)
+    matcher = NearestNeighbors(options, context)
+    found = matcher.match(matcher.prepare(first), matcher.prepare(second))
+    return found.indices.tolist()
+
+
+def test_pair_with_nothing_in_common_is_matched_by_the_strongest_half_alone() -> None:
+    first = shaped_image(1)
+    second = shaped_image(2)
+    every = matched_rows(first, second, may_give_up=False)
+    some = matched_rows(first, second, may_give_up=True)
+    responses = first.features.responses
+    assert 20 < len(some) < 0.7 * len(every)
+    weakest = min(responses[row] for row, _ in some)
+    assert NUM_SHAPED // 2 < weakest < 0.6 * NUM_SHAPED
+    assert some == [pair for pair in every if responses[pair[0]] > NUM_SHAPED // 2]
+
+
+def test_pair_whose_strongest_half_agrees_is_matched_as_a_whole() -> None:
+    first = shaped_image(1)
+    second = shaped_image(2, related_to=first)
+    every = matched_rows(first, second, may_give_up=False)
+    assert len(every) > 0.9 * NUM_SHAPED
+    assert matched_rows(first, second, may_give_up=True) == every
+
+
+def test_many_matches_have_something_in_common_however_they_lie() -> None:
+    first = shaped_image(1)
+    second = shaped_image(2, related_to=first)
+    scattered = second.features.lafs.copy()
+    scattered[:, :, 2] = shaped_image(3).features.lafs[:, :, 2]
+    second = replace(second, features=replace(second.features, lafs=scattered))
+    halved = len(matched_rows(first, second, may_give_up=True))
+    assert halved <= NUM_SHAPED // 2  # 200 matches that contradict each other
+    both = [with_features(image, times=2) for image in (first, second)]
+    assert len(matched_rows(both[0], both[1], may_give_up=True)) > 1.5 * NUM_SHAPED
+
+
+def with_features(image: ImageFeatures, times: int) -> ImageFeatures:
+    """The image beside copies of itself, whose descriptors differ."""
+    known = image.features
+    lafs = []
+    descriptors = []
+    for number in range(times):
+        shift = np.array([0.0, 0.0, 2000.0 * number])
+        lafs.append(known.lafs + shift)
+        descriptors.append(np.roll(known.descriptors, 5 * number, axis=1))
+    responses = np.tile(known.responses, times)
+    features = LocalFeatures(
+        np.concatenate(lafs), responses, np.concatenate(descriptors)
+    )
+    return replace(image, features=features)
+
+
+def test_pair_whose_frames_tell_nothing_is_matched_as_a_whole() -> None:
+    images = []
+    for seed in (1, 2):
+        image = shaped_image(seed)
+        circles = image.features.lafs.copy()
+        circles[:, :, :2] = 4.0 * np.eye(2)
+        images.append(replace(image, features=replace(image.features, lafs=circles)))
+    every = matched_rows(images[0], images[1], may_give_up=False)
+    assert matched_rows(images[0], images[1], may_give_up=True) == every

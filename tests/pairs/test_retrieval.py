@@ -94,3 +94,21 @@ def test_similarities_are_cosines_about_the_mean_however_many_at_once(
     assert_allclose(
         np.stack(list(similarities(vectors))), centered @ centered.T, atol=2e-3
     )
+
+
+def test_vectors_are_centered_once_where_parts_are_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    num_centered = 0
+    unit_rows_of = retrieval._unit_rows
+
+    def counted(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        nonlocal num_centered
+        num_centered += len(rows)
+        return unit_rows_of(rows)
+
+    monkeypatch.setattr(retrieval, "VECTORS_AT_ONCE", 2)
+    monkeypatch.setattr(retrieval, "_unit_rows", counted)
+    vectors = np.random.default_rng(7).random((8, 24)).astype(np.float16)
+    assert len(list(similarities(vectors))) == num_centered == len(vectors)
+    assert 2 <= retrieval.NUM_CENTERED_PARTS <= 16  # of 64 MiB each

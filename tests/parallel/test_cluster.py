@@ -1,4 +1,4 @@
-"""Extraction and matching elsewhere: on a cluster of this machine, some of it lost midway."""
+"""Work on images and pairs elsewhere: on a cluster of this machine, some of it lost midway."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from results import hdf5_content
 from small_scene import write_photographs
 from verified import CAMERAS
 
+from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel import cluster_watch
@@ -41,6 +42,7 @@ from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.match import Matching, iterate_matches, match
 from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 START_TIMEOUT_S = 60.0
 RECIPE = load_recipe("unrectified-rootsift")
@@ -255,6 +257,7 @@ def greet(server: socket.socket, said: bytes) -> None:
 def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"1")
     here = environment([str(tmp_path / "a.png"), str(tmp_path)])
+    assert {"pycolmap", "torch"} <= here.keys()  # both compute
     require_environment(here)
     with pytest.raises(
         AffrectError, match=r"kornia is .*, and 0\.1 on the machine that leads"
@@ -356,3 +359,23 @@ def test_cluster_finds_what_threads_find(
     expected = matched(tmp_path / "local", extracted, weights, Threads(2))
     with connected(address) as cluster:
         assert matched(tmp_path / "cluster", extracted, weights, cluster) == expected
+
+
+def verified(out: Path, matched_path: Path, executor: Executor | None) -> str:
+    """Verify in a copy of a folder; return a digest of all rows of its database."""
+    shutil.copytree(matched_path, out)
+    with Workspace(out).locked() as workspace:
+        report = verify_matches(Context(workspace, executor=executor))
+    assert report.num_done == 6
+    return rows_digest(workspace.database)
+
+
+@pytest.mark.long
+def test_cluster_verifies_what_threads_verify(
+    tmp_path: Path, photos: Path, address: str
+) -> None:
+    run_stages(tmp_path / "matched", photos, None)
+    expected = verified(tmp_path / "local", tmp_path / "matched", None)
+    with connected(address) as cluster:
+        found = verified(tmp_path / "cluster", tmp_path / "matched", cluster)
+    assert found == expected

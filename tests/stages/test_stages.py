@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import sqlite3
@@ -28,6 +29,8 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.matchers.base import ImageFeatures
+from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_store import pair_key
@@ -41,6 +44,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import advice as advice_module
 from colmap_affrect.report.advice import advice
 from colmap_affrect.session.context import Context, Resources
+from colmap_affrect.stages import match as match_stage
 from colmap_affrect.stages.map import line_cameras
 from colmap_affrect.stages.verify import verify_matches
 
@@ -334,6 +338,30 @@ def test_idle_run_looks_at_no_header(
     monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
     monkeypatch.setattr("colmap_affrect.project.match_store.MatchStore.has", None)
     run(photos, copy.path, OPTIONS)
+
+
+def test_pairs_are_given_up_where_those_of_a_dozen_photographs_or_more_are_listed(
+    copy: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The list counts, not what is left of it: a run that goes on finds the same."""
+    asked = list[bool]()
+    prepare = NearestNeighbors.prepare
+
+    def prepared(matcher: NearestNeighbors, image: ImageFeatures) -> MatchableImage:
+        asked.append(matcher.may_give_up)
+        return prepare(matcher, image)
+
+    monkeypatch.setattr(NearestNeighbors, "prepare", prepared)
+    assert math.comb(10, 2) < match_stage.MIN_PAIRS_TO_GIVE_UP <= math.comb(20, 2)
+    context = Context(copy)
+    listed = context.listed_pairs()
+    for least, gives_up in ((len(listed) + 1, False), (len(listed), True)):
+        monkeypatch.setattr(match_stage, "MIN_PAIRS_TO_GIVE_UP", least)
+        asked.clear()
+        context.matches.remove(pairs=[listed[0]])
+        with copy.locked():
+            match_stage.match(context)
+        assert set(asked) == {gives_up}
 
 
 @pytest.mark.parametrize("name", NAMES[1:3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -27,8 +28,9 @@ def stores(
     folder: Path,
     points: list[NDArray[np.float64]],
     sizes: list[tuple[int, int]] | None = None,
+    pairs: list[tuple[str, str]] | None = None,
 ) -> tuple[FeatureStore, MatchStore, list[tuple[str, str]]]:
-    """Write images whose features of one number are matched with each other."""
+    """Write images whose features of one number are matched with each other, by default all."""
     features = FeatureStore(folder / "features.h5")
     matches = MatchStore(folder / "matches.h5")
     names = [f"{k}.jpg" for k in range(len(points))]
@@ -40,7 +42,7 @@ def stores(
         lafs = lafs_from_keypoints(places, 5.0 * ones, 0.0 * ones)
         descriptors = np.ones((count, 8), np.float32) / np.sqrt(8)
         features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size)
-    pairs = list(combinations(names, 2))
+    pairs = pairs or list(combinations(names, 2))
     count = len(points[0])
     indices = np.stack([np.arange(count)] * 2, axis=1)
     scores = np.linspace(0.1, 0.9, count, dtype=np.float32)
@@ -348,3 +350,20 @@ def test_photographs_of_other_sizes_are_left_alone(tmp_path: Path) -> None:
     sizes = [SIZE, (640, 960), (961, 640), (960, 641)]
     features, matches, pairs = stores(tmp_path, scans(4), sizes)
     assert StationaryFilter(features, matches).learn(pairs) == []
+
+
+def test_memory_does_not_grow_with_sizes_times_photographs(tmp_path: Path) -> None:
+    """Thirty sizes of two photographs each: of each, cells are noted of its own photographs."""
+    num_sizes = 30
+    points = [SCENE[:5]] * (2 * num_sizes)
+    sizes = [(200 + k // 2, 150) for k in range(2 * num_sizes)]
+    pairs = [(f"{k}.jpg", f"{k + 1}.jpg") for k in range(0, 2 * num_sizes, 2)]
+    features, matches, _ = stores(tmp_path, points, sizes, pairs)
+    found = StationaryFilter(features, matches)
+    tracemalloc.start()
+    try:
+        assert found.learn(pairs) == []
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 4e6  # flags of cells and photographs alone would take as much
