@@ -37,6 +37,7 @@ from colmap_affrect.mappers.pair_graph import (
 from colmap_affrect.mappers.reliability import NUM_REASONS, Confidence, score_images
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
+from colmap_affrect.mappers.surer_apart import surer_apart
 from colmap_affrect.mappers.surroundings import apart, places_of
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
@@ -253,6 +254,7 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
         _doubt_motion(whole, task)
         return [whole]
     places = places_of(mapped.reconstruction, graph)
+    places = surer_apart(mapped, places, lambda one: _probabilities(one, task))
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
     for name, doubt in mapped.apart.items():
@@ -261,7 +263,7 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
     for other in others:
         names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
         for name in names:
-            scored.taken_out[name] = Confidence(0.0, (Doubt("other_surroundings"),))
+            scored.taken_out[name] = Confidence(0.0, (Doubt(places.why),))
         if len(names) > 1:
             found.append(_without_wrong_images(other, task))
     for model in found:
@@ -270,6 +272,16 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
             _doubt(model, graph.names[image_id], 0.5, Doubt("two_places"))
         for image_id, share in places.unclear.items():
             _doubt(model, graph.names[image_id], share, Doubt("other_surroundings"))
+    return found
+
+
+def _probabilities(mapped: MappedModel, task: MappingTask) -> dict[int, float]:
+    """Return the probability of each image that stays in a model, which is changed."""
+    confidences = _without_wrong_images(mapped, task).confidences
+    found = dict[int, float]()
+    for name, one in confidences.items():
+        image_id = mapped.reconstruction.find_image_with_name(name).image_id
+        found[image_id] = one.probability
     return found
 
 
