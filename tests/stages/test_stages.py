@@ -257,7 +257,7 @@ def test_advice_is_about_what_is_wrong(
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
     (disagreeing,) = advice(context, [*NAMES], [], 900)
     assert "contradict each other" in disagreeing.why
-    monkeypatch.setattr(advice_module, "_share_without_depth", lambda _: 0.95)
+    monkeypatch.setattr(advice_module, "_strongest_shows_depth", lambda _: False)
     (copies,) = advice(context, [*NAMES], [], 900)
     assert "show no depth" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
