@@ -192,6 +192,7 @@ def map_database(
         min_model_size = 1 if task.extend else mapper.options.min_model_size
         kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
+        _pass_on_reasons(scored, kept)
         summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -206,6 +207,17 @@ def _large_enough(
     """Return the models that are large enough, for the number of all images."""
     least = max(1, min(min_model_size, int(ENOUGH_OF_SMALL_SET * num_images)))
     return [model for model in models if len(model.confidences) >= least]
+
+
+def _pass_on_reasons(models: Sequence[_ScoredModel], kept: list[_ScoredModel]) -> None:
+    """Let the first model that is kept say of images of dropped ones why they were taken out."""
+    inside = set[str]()
+    for model in kept:
+        inside |= model.confidences.keys() | model.taken_out.keys()
+    for model in models:
+        for name, one in model.taken_out.items():
+            if kept and name not in inside:
+                kept[0].taken_out[name] = one
 
 
 def _remove_unfinished(partial: Path) -> None:
