@@ -85,7 +85,7 @@ def test_forecasts_of_whole_runs_are_right_within_a_factor_of_two(
     first_model_s = clock.now_s
     if after == "escalation":
         forecast.expect(first_model_s)
-        found += run_stage(clock, forecast, "escalate, aliked", 10, first_model_s / 20)
+        found += run_stage(clock, forecast, "escalate", 10, first_model_s / 20)
         forecast.expect(0.0)
     found += run_stage(clock, forecast, "pictures", 20, 0.1)
     late = [whole_s for whole_s in found if whole_s > 0][len(found) // 10 :]
