@@ -166,9 +166,8 @@ def shows_depth(points1: Array, points2: Array, max_error_px: float) -> bool:
         Whether they do.
     """
     _, is_explained = cv2.findHomography(points1, points2, cv2.RANSAC, max_error_px)
-    if is_explained is None:
-        return True
-    num_others = len(points1) - int(np.sum(is_explained))
+    num_explained = 0 if is_explained is None else int(np.sum(is_explained))
+    num_others = len(points1) - num_explained
     return num_others >= max(MIN_NUM_MATCHES, MAX_BY_CHANCE * len(points1))
 
 
