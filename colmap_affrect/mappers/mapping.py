@@ -43,6 +43,7 @@ from colmap_affrect.mappers.reliability import (
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.snapshots import with_snapshots
+from colmap_affrect.mappers.surer_apart import surer_apart
 from colmap_affrect.mappers.surroundings import apart, known_places
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.project.atomic_files import replace_text
@@ -204,6 +205,7 @@ def map_database(
         min_model_size = 1 if task.extend else mapper.options.min_model_size
         kept = _large_enough(scored, min_model_size, num_images)
         kept.sort(key=lambda model: model.size, reverse=True)
+        _pass_on_reasons(scored, kept)
         summaries = _write_models(kept, task, partial)
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -218,6 +220,17 @@ def _large_enough(
     """Return the models that are large enough, for the number of all images."""
     least = max(1, min(min_model_size, int(ENOUGH_OF_SMALL_SET * num_images)))
     return [model for model in models if len(model.confidences) >= least]
+
+
+def _pass_on_reasons(models: Sequence[_ScoredModel], kept: list[_ScoredModel]) -> None:
+    """Let the first model that is kept say of images of dropped ones why they were taken out."""
+    inside = set[str]()
+    for model in kept:
+        inside |= model.confidences.keys() | model.taken_out.keys()
+    for model in models:
+        for name, one in model.taken_out.items():
+            if kept and name not in inside:
+                kept[0].taken_out[name] = one
 
 
 def _remove_unfinished(partial: Path) -> None:
@@ -266,6 +279,7 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
         _doubt_motion(whole, task)
         return [whole]
     places = known_places(mapped, graph)
+    places = surer_apart(mapped, places, lambda one: _probabilities(one, task))
     largest, *others = apart(mapped, places)
     scored = _without_wrong_images(largest, task)
     for name, doubt in mapped.apart.items():
@@ -274,7 +288,7 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
     for other in others:
         names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
         for name in names:
-            scored.taken_out[name] = Confidence(0.0, (Doubt("other_surroundings"),))
+            scored.taken_out[name] = Confidence(0.0, (Doubt(places.why),))
         if len(names) > 1:
             found.append(_without_wrong_images(other, task))
     for model in found:
@@ -283,6 +297,16 @@ def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]
             _doubt(model, graph.names[image_id], 0.5, Doubt("two_places"))
         for image_id, share in places.unclear.items():
             _doubt(model, graph.names[image_id], share, Doubt("other_surroundings"))
+    return found
+
+
+def _probabilities(mapped: MappedModel, task: MappingTask) -> dict[int, float]:
+    """Return the probability of each image that stays in a model, which is changed."""
+    confidences = _without_wrong_images(mapped, task).confidences
+    found = dict[int, float]()
+    for name, one in confidences.items():
+        image_id = mapped.reconstruction.find_image_with_name(name).image_id
+        found[image_id] = one.probability
     return found
 
 

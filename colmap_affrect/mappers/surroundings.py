@@ -9,7 +9,8 @@ from a similar direction and has no surface of its own before it.
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -27,6 +28,7 @@ from colmap_affrect.mappers.model_score import (
     grid_cells,
 )
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
+from colmap_affrect.project.reasons import DoubtCode
 
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
 MAX_ANGLE_DEG = 40.0
@@ -46,6 +48,9 @@ TIED = 1.5  # of a pair: as much as about ten cells tell that are all found (the
 ONE_PLACE = 3.0  # log odds beforehand of one place, twenty to one (theory)
 # Share of the cells of the smaller region that two regions share; judged
 MAX_COMMON = 0.1
+CLUMP = 1.25
+"""Matches that come together: few of them leave cells empty by chance. Measured: with 1 right
+photographs of an old print look like another place, with 1.5 two places with one statue do not."""
 MIN_EXPECTED = 8  # cells, an eighth of a photograph: less tells nothing (judged)
 # Shares of expected cells that are found. Measured: 0.85 to 1 of pairs of true scenes, seldom 0.6.
 # A poster or a statue in two places may take any share: 0.22 to 0.54, and 0.55 to 0.8 (theory)
@@ -75,11 +80,21 @@ class Overlap:
         return self.num_expected >= MIN_EXPECTED
 
 
+@dataclass(frozen=True)
+class _Expected:
+    """Points of one photograph where another one should see them."""
+
+    ids: Indices  # (N,)
+    cells: Indices  # (N,) of the other photograph
+    is_found: Bools  # (N,) whether that observes them
+
+
 class _Views:
     """What the photographs of a model observe."""
 
     def __init__(self, model: pycolmap.Reconstruction) -> None:
         self.model = model
+        self._expectations = dict[Ids, _Expected]()
         self._seen = dict[int, tuple[Array, Indices, Array]]()
         self._observed = dict[int, Indices]()
 
@@ -104,8 +119,8 @@ class _Views:
 
     def overlap(self, first: int, second: int) -> Overlap:
         """Return the mean of what is expected and found of both images in the other one."""
-        there = self._expected(first, second)
-        back = self._expected(second, first)
+        there = self.overlap_with(second, [first])
+        back = self.overlap_with(first, [second])
         return Overlap(
             (there.num_expected + back.num_expected) / 2,
             (there.num_found + back.num_found) / 2,
@@ -132,11 +147,35 @@ class _Views:
         common = len(regions[0] & regions[1])
         return smaller > 0 and common <= MAX_COMMON * smaller
 
-    def _expected(self, source: int, target: int) -> Overlap:
-        """Return the cells of the target where points of the source are expected, and found."""
+    def overlap_with(
+        self, target: int, sources: Collection[int], clump: float = 1.0
+    ) -> Overlap:
+        """Return what is expected in an image of all that others see, and what of it is found.
+
+        What one pair misses, another one finds; what is beside a poster, none does.
+
+        Args:
+            target: The image.
+            sources: The others.
+            clump: Matches that come together.
+        """
+        found = [self._expected(source, target) for source in sources]
+        ids = np.concatenate([one.ids for one in found])
+        cells = np.concatenate([one.cells for one in found])
+        is_found = np.concatenate([one.is_found for one in found])
+        _, first_rows = np.unique(ids, return_index=True)
+        return _counted(cells[first_rows], is_found[first_rows], clump)
+
+    def _expected(self, source: int, target: int) -> _Expected:
+        """Return the points of the source that are expected in the target."""
+        if (source, target) not in self._expectations:
+            self._expectations[source, target] = self._expectation(source, target)
+        return self._expectations[source, target]
+
+    def _expectation(self, source: int, target: int) -> _Expected:
         _, ids, positions = self.seen(source)
         if not len(ids):
-            return Overlap(0, 0)
+            return _Expected(ids, ids, ids > 0)
         camera = self.model.cameras[self.model.images[target].camera_id]
         pose = self.model.images[target].cam_from_world().matrix()
         local = positions @ pose[:, :3].T + pose[:, 3]
@@ -149,7 +188,7 @@ class _Views:
         is_hidden = self._is_hidden(target, points_px[open_rows], local[open_rows, 2])
         is_expected[open_rows[is_hidden]] = False
         cells = grid_cells(camera, points_px[is_expected])
-        return _counted(cells, is_found[is_expected])
+        return _Expected(ids[is_expected], cells, is_found[is_expected])
 
     def _looks_alike(self, source: int, target: int, positions: Array) -> Bools:
         """Tell which positions two images see from similar directions and at similar scales."""
@@ -206,7 +245,7 @@ def _projected(camera: pycolmap.Camera, local: Array) -> Array:
     return points_px
 
 
-def _counted(cells: Indices, is_found: Bools) -> Overlap:
+def _counted(cells: Indices, is_found: Bools, clump: float) -> Overlap:
     """Count the cells that have matches, and those that would if matches were where points are.
 
     Few matches are in few cells, wherever they are.
@@ -214,13 +253,14 @@ def _counted(cells: Indices, is_found: Bools) -> Overlap:
     Args:
         cells: (N,) number of the cell of each point that is expected.
         is_found: (N,) whether it is found.
+        clump: Matches that come together.
     """
     num_points = np.bincount(cells, minlength=GRID * GRID)
     num_found = np.bincount(cells, weights=is_found, minlength=GRID * GRID)
     counts = num_points >= MIN_POINTS
-    num_matches = float(num_found[counts].sum())
+    num_clumps = float(num_found[counts].sum()) / clump
     shares = num_points[counts] / max(num_points[counts].sum(), 1)
-    num_expected = float((1.0 - (1.0 - shares) ** num_matches).sum())
+    num_expected = float((1.0 - (1.0 - shares) ** num_clumps).sum())
     num_occupied = float((num_found[counts] > 0).sum())
     return Overlap(max(num_expected, num_occupied), num_occupied)
 
@@ -234,6 +274,10 @@ class Places:
     """Images of two places: one region matches one of them, another one the other."""
     unclear: dict[int, float] = field(default_factory=dict)
     """Probability, by image, that it is of the place of others that it is taken for."""
+    tied: list[set[int]] = field(default_factory=list)
+    """Images that pairs tie whose surroundings match: parts of places."""
+    why: DoubtCode = "other_surroundings"
+    """Why places are apart."""
 
     @property
     def is_clearly_one(self) -> bool:
@@ -273,7 +317,8 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
         if one.tells and one.log_ratio >= TIED:
             tied.append(ids)
     found = Places([])
-    merged = _merged(connected_parts(tied, images), overlaps, found.unclear)
+    found.tied = connected_parts(tied, images)
+    merged = _merged(found.tied, overlaps, views, found.unclear)
     for place in merged:
         found.images += _cut_at_collages(place, overlaps, views, found.collages)
     found.images.sort(key=lambda part: (-len(part), min(part)))
@@ -291,18 +336,20 @@ class _Merger:
 
 def _merged(
     parts: Sequence[set[int]],
-    overlaps: Mapping[Ids, Overlap],
+    pairs: Collection[Ids],
+    views: _Views,
     unclear: dict[int, float],
 ) -> list[set[int]]:
     """Merge parts unless the surroundings of the pairs between them contradict that.
 
     Args:
         parts: Of images.
-        overlaps: By pair.
+        pairs: Of images.
+        views: What images observe.
         unclear: Gets the images of smaller parts of which that is not clear.
     """
     left = list(parts)
-    merger = _best_merger(left, overlaps)
+    merger = _best_merger(left, pairs, views)
     while merger:
         first = merger.first
         second = merger.second
@@ -312,7 +359,7 @@ def _merged(
                 unclear[image_id] = min(probability, unclear.get(image_id, 1.0))
         left = [part for part in left if part not in (first, second)]
         left.append(first | second)
-        merger = _best_merger(left, overlaps)
+        merger = _best_merger(left, pairs, views)
     return left
 
 
@@ -324,26 +371,40 @@ def _not_larger(first: set[int], second: set[int]) -> set[int]:
 
 
 def _best_merger(
-    parts: Sequence[set[int]], overlaps: Mapping[Ids, Overlap]
+    parts: Sequence[set[int]], pairs: Collection[Ids], views: _Views
 ) -> _Merger | None:
     """Return the two parts that are most likely of one place, if any are not contradicted."""
     best = None
     highest = CONTRADICTED
     for first, second in combinations(parts, 2):
+        partners = _partners_between(first, second, pairs)
         between = list[Overlap]()
-        for ids, one in overlaps.items():
-            if not first.isdisjoint(ids) and not second.isdisjoint(ids):
-                between.append(one)
+        for image_id, others in partners.items():
+            between.append(views.overlap_with(image_id, others, CLUMP))
         log_ratio = _joint_log_ratio(between)
         is_better = log_ratio > highest or (best is None and log_ratio == highest)
-        if between and is_better:
+        if partners and is_better:
             highest = log_ratio
             best = _Merger(log_ratio, first, second)
     return best
 
 
+def _partners_between(
+    first: set[int], second: set[int], pairs: Collection[Ids]
+) -> dict[int, list[int]]:
+    """Return of each image that pairs tie to the other part the images there."""
+    found = defaultdict[int, list[int]](list)
+    for ids in pairs:
+        is_between = not first.isdisjoint(ids) and not second.isdisjoint(ids)
+        if is_between:
+            one, other = ids
+            found[one].append(other)
+            found[other].append(one)
+    return dict(found)
+
+
 def _joint_log_ratio(overlaps: Sequence[Overlap]) -> float:
-    """Return the log-likelihood ratio of pairs that err together, at least in part.
+    """Return the log-likelihood ratio of images that err together, at least in part.
 
     It grows with the root of their number, as if each told half of what it tells alone.
     """

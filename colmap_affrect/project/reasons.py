@@ -24,6 +24,7 @@ DoubtCode = Literal[
     "principal_point_contradicted",
     "other_surroundings",
     "two_places",
+    "surer_apart",
     "hangs_on",
     "something_moves",
 ]
@@ -63,6 +64,7 @@ SENTENCES: dict[DoubtCode, str] = {
         "which the model says are the same, do not match"
     ),
     "two_places": "it alone ties two places, each by another part of it, as a collage does",
+    "surer_apart": "what ties it to the model leaves open how both stand to each other",
     "hangs_on": "it hangs on {other}, which is right with a probability of {percent}% itself",
     "something_moves": (
         "something moves as one between photographs, against the rest: {percent}% of what they "

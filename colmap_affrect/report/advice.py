@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 
 from colmap_affrect.errors import such_as
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.pair_graph import MAX_ERROR
+from colmap_affrect.mappers.pair_graph import MAX_ERROR, MIN_NUM_MATCHES
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.reasons import Doubt, DoubtCode
@@ -22,8 +23,9 @@ from colmap_affrect.session.context import Context, Inputs
 
 STRONGEST = "default"  # of the recipes
 ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
-# Inliers of a pair that a homography explains, from which on they show no depth (judged)
-MIN_SHARE_WITHOUT_DEPTH = 0.9
+MAX_BY_CHANCE = 0.03
+"""Share of the inliers of a pair that chance alone may put on epipolar lines and off a homography
+(theory: the width of their band by that of a photograph)."""
 MIN_GAIN = 0.05  # of a probability, by more matches
 CONTRADICTED: Collection[DoubtCode] = ("matches_disagree", "little_agreement")
 """Doubts of photographs whose matches are rather wrong than few."""
@@ -113,7 +115,7 @@ def advice(
     found = _of_effort(case)
     if not models and strongest >= ENOUGH:
         why = "more photographs, from other places: the matches of these show no depth"
-        if _share_without_depth(context) < MIN_SHARE_WITHOUT_DEPTH:
+        if _strongest_shows_depth(context):
             why = "more photographs between these: matches show depth, but contradict each other"
         return (*found, Advice(why))
     if lost or case.doubts or case.moves:
@@ -132,12 +134,8 @@ def command_with_masks(context: Context) -> str:
     return _anew(context, "--mask-path", "masks")
 
 
-def _share_without_depth(context: Context) -> float:
-    """Return the share of the inliers of the strongest pair that no depth has to explain.
-
-    A homography explains them: of a plane, or of a camera that turned, whatever its focal length
-    and its optical axis.
-    """
+def _strongest_shows_depth(context: Context) -> bool:
+    """Tell whether the inliers of the strongest pair show depth."""
     inliers = context.graph.inliers(1)
     names = max(inliers, key=lambda pair: len(inliers[pair]))
     points = []
@@ -149,10 +147,28 @@ def _share_without_depth(context: Context) -> float:
             points.append(np.asarray(keypoints, np.float64)[rows, :2])
             camera = context.graph.cameras[name]
             sides += [camera.width, camera.height]
-    _, is_explained = cv2.findHomography(
-        points[0], points[1], cv2.RANSAC, MAX_ERROR * max(sides)
-    )
-    return 0.0 if is_explained is None else float(np.mean(is_explained))
+    return shows_depth(points[0], points[1], MAX_ERROR * max(sides))
+
+
+def shows_depth(points1: Array, points2: Array, max_error_px: float) -> bool:
+    """Tell whether inliers of a pair show depth, beyond their noise.
+
+    A homography explains those of a plane, and of a camera that turned, whatever its focal length
+    and its optical axis. Depth is shown by as many others as would make a pair by themselves, and
+    more than chance leaves.
+
+    Args:
+        points1: (N, 2) px of inliers in one photograph.
+        points2: (N, 2) px in the other one.
+        max_error_px: Largest error of what a homography explains.
+
+    Returns:
+        Whether they do.
+    """
+    _, is_explained = cv2.findHomography(points1, points2, cv2.RANSAC, max_error_px)
+    num_explained = 0 if is_explained is None else int(np.sum(is_explained))
+    num_others = len(points1) - num_explained
+    return num_others >= max(MIN_NUM_MATCHES, MAX_BY_CHANCE * len(points1))
 
 
 def _of_fitting_focal(case: _Case) -> list[Advice]:
@@ -205,7 +221,7 @@ def _of_bridges(case: _Case) -> list[Advice]:
 def _of_unknown_focal(case: _Case) -> list[Advice]:
     if not (case.may_change_cameras and case.has_doubt(["focal_unknown"])):
         return []
-    why = "give lens and film, plate or sensor; if you do not know them, try a normal lens"
+    why = "give lens and film, plate or sensor if you know them: a guess misleads"
     return [
         Advice(why, _anew(case.context, "--focal-mm", "50", "--film-width-mm", "36"))
     ]

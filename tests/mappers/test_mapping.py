@@ -35,7 +35,11 @@ from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTas
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import (
+    _pass_on_reasons,
+    _ScoredModel,
+    map_database,
+)
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -324,6 +328,18 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
     assert len(model.registered_names) == num_images
     assert len(model.doubtful) == (num_images == 3)
     assert len(model.taken_out) == (num_images == 2)
+
+
+def test_why_a_dropped_model_was_wrong_is_said_by_the_one_that_is_kept() -> None:
+    """Its photographs are in no other model, and were not simply left unregistered."""
+    empty = MappedModel(pycolmap.Reconstruction())
+    wrong = Confidence(0.01, (Doubt("matches_disagree"),))
+    other = Confidence(0.02, (Doubt("few_matches"),))
+    kept = _ScoredModel(empty, {"a": Confidence(0.9, ())}, {"b": other})
+    dropped = _ScoredModel(empty, {}, {"a": wrong, "b": wrong, "c": wrong})
+    _pass_on_reasons([kept, dropped], [kept])
+    assert kept.taken_out == {"b": other, "c": wrong}
+    _pass_on_reasons([dropped], [])
 
 
 def test_verified_pairs_are_read_once_also_where_there_are_snapshots(

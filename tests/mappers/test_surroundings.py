@@ -31,8 +31,11 @@ from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.mappers.surroundings import (
+    CLUMP,
     Overlap,
+    _Expected,
     _merged,
+    _Views,
     known_places,
     places_of,
 )
@@ -270,16 +273,63 @@ def test_a_model_that_is_known_to_be_of_one_place_is_looked_at_once(
     assert len(known_places(taken_for_known, other_graph).images) == 2
 
 
+class FoundEverywhere:
+    """Says of each image that so many of its expected cells are found."""
+
+    def __init__(self, found: float) -> None:
+        self.overlap = Overlap(28.0, found)
+
+    def overlap_with(self, *_: Any) -> Overlap:
+        return self.overlap
+
+
 @pytest.mark.parametrize(
     ("found", "unclear"),
-    [(28.0, set()), (16.0, {1, 2}), (22.0, set())],
+    [(28.0, set()), (17.0, {1, 2}), (22.0, set())],
 )
 def test_of_parts_that_are_rather_two_places_the_smaller_one_is_unclear(
     found: float, unclear: set[int]
 ) -> None:
-    overlaps = {(1, 3): Overlap(28.0, found), (2, 4): Overlap(28.0, found)}
+    pairs: Any = [(1, 3), (2, 4)]
+    views_of_both: Any = FoundEverywhere(found)
     probabilities = dict[int, float]()
-    merged = _merged([{1, 2}, {3, 4, 5}], overlaps, probabilities)
+    merged = _merged([{1, 2}, {3, 4, 5}], pairs, views_of_both, probabilities)
     assert merged == [{1, 2, 3, 4, 5}]
     assert set(probabilities) == unclear
     assert all(probability < DOUBTFUL for probability in probabilities.values())
+
+
+def one_sees(is_found_by_pair: list[Any]) -> Any:
+    """What image 1 sees of what images 2, 3, ... do, each with 320 other points."""
+    views_of_all = _Views(pycolmap.Reconstruction())
+    cells = np.repeat(np.arange(64), 5)
+    for number, is_found in enumerate(is_found_by_pair):
+        ids = 1000 * number + np.arange(len(cells))
+        views_of_all._expectations[number + 2, 1] = _Expected(ids, cells, is_found)
+    return views_of_all
+
+
+def test_what_one_pair_misses_others_find_and_beside_a_statue_none_does() -> None:
+    random = np.random.default_rng(0)
+    cells = np.repeat(np.arange(64), 5)
+    all_over = [random.random(len(cells)) < 0.15 for _ in range(4)]
+    of_statue = [(cells < 24) & (random.random(len(cells)) < 0.4) for _ in range(4)]
+    sources = [2, 3, 4, 5]
+    one_place = one_sees(all_over).overlap_with(1, sources)
+    statue = one_sees(of_statue).overlap_with(1, sources)
+    assert one_place.num_found > 0.95 * one_place.num_expected
+    assert one_place.log_ratio > 1.0
+    assert statue.num_found == 24.0
+    assert statue.log_ratio < -5.0
+
+
+def test_few_matches_that_come_together_leave_cells_empty() -> None:
+    """Of 64 cells 32 matches in 20 are as many as clumps let expect, and too few else."""
+    is_found = np.zeros(320, bool)
+    is_found[:100:5] = True
+    is_found[1:61:5] = True
+    few = one_sees([is_found])
+    apart_each = few.overlap_with(1, [2])
+    in_clumps = few.overlap_with(1, [2], CLUMP)
+    assert in_clumps.num_found == apart_each.num_found == 20.0
+    assert in_clumps.num_expected < apart_each.num_expected - 2.0

@@ -280,21 +280,18 @@ def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
 
 
 @pytest.mark.parametrize(
-    ("share_without_depth", "why"),
-    [
-        (0.5, "contradict each other"),
-        (0.85, "contradict each other"),
-        (0.95, "show no depth"),
-    ],
+    ("shows_depth", "why"),
+    [(True, "contradict each other"), (False, "show no depth")],
 )
 def test_strong_pairs_that_make_no_model_contradict_each_other_or_show_no_depth(
     adviser: Adviser,
     monkeypatch: pytest.MonkeyPatch,
-    share_without_depth: float,
     why: str,
+    *,
+    shows_depth: bool,
 ) -> None:
-    share = Mock(return_value=share_without_depth)
-    monkeypatch.setattr(advice_module, "_share_without_depth", share)
+    found_depth = Mock(return_value=shows_depth)
+    monkeypatch.setattr(advice_module, "_strongest_shows_depth", found_depth)
     (found,) = advice(adviser.context, [*NAMES], [], 900)
     assert why in found.why
 

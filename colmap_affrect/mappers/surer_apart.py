@@ -1,0 +1,56 @@
+"""Whether parts of a model are surer apart: what ties them says too little.
+
+A few matches on one poster may tie two rooms, and leave open how these stand to each other. Then no
+photograph of the model can be trusted, while each part alone is sure.
+"""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.surroundings import Places, apart
+from colmap_affrect.project.report import DOUBTFUL
+
+MIN_PART = 2  # photographs that make a model; theory
+
+Probabilities = Mapping[int, float]  # by image id
+Score = Callable[[MappedModel], Probabilities]
+
+
+def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
+    """Return places, of which one that is doubtful throughout is cut where its parts are surer.
+
+    Args:
+        mapped: The model; it stays as it is.
+        places: That it holds.
+        score: Returns the probabilities of the images that stay in a model, which it may change.
+
+    Returns:
+        The parts that pairs tie whose surroundings match, as places, where more of their relative
+        poses are expected to be right than of the whole; else the places as they are.
+    """
+    parts = [part for part in places.tied if len(part) >= MIN_PART]
+    if len(places.images) > 1 or len(parts) < MIN_PART:
+        return places
+    together = dict(score(_copied(mapped)))
+    for image_id, probability in places.unclear.items():
+        if image_id in together:
+            together[image_id] *= probability
+    if max(together.values(), default=0.0) >= DOUBTFUL:
+        return places
+    parts.sort(key=lambda part: (-len(part), min(part)))
+    cut = replace(places, images=parts, unclear={}, why="surer_apart")
+    expected = 0.0
+    for part in apart(_copied(mapped), cut):
+        expected += _expected_right(score(part))
+    return cut if expected > _expected_right(together) else places
+
+
+def _copied(mapped: MappedModel) -> MappedModel:
+    return replace(mapped, reconstruction=copy.deepcopy(mapped.reconstruction))
+
+
+def _expected_right(probabilities: Probabilities) -> float:
+    """Return how many poses relative to a first image are expected to be right."""
+    return max(0.0, sum(probabilities.values()) - 1.0)
