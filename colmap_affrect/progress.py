@@ -26,7 +26,8 @@ AFTER_FIRST_MODEL = ("escalate", "learned", "pictures")
 """How the names of the stages begin that follow the first model."""
 AFTER_SHARE = 1.0
 """Of the time until the first model, the most that follows it beside learned matching; the effort
-``normal``. Nothing follows where the model is sure of all: which of both, only it can tell."""
+``normal``, as its definition has it (theory). Nothing follows a model that is sure of all: which
+of both, only it can tell."""
 FACTOR = 2.0  # that a forecast may be off; where it may be more, two are told; display
 GOES_ON_SHARE = 0.5
 """Of the time that mapping has taken already: what it still takes, at least, since hypotheses
