@@ -35,6 +35,8 @@ class Building:
     num_each: int = 25  # edges of each direction
     noise_px: float = 0.4  # of the ends
     directions: tuple[int, ...] = (0, 1, 2)
+    # of the lens: a point at u from the middle is seen at u * (1 + distortion * |u|**2)
+    distortion: float = 0.0
 
     def edges(self, seed: int = 0) -> Array:
         """(N, 4) ends in pixel-centre px of an image of ``SIZE``."""
@@ -48,6 +50,7 @@ class Building:
             end = start + self.rotation[:, direction] * random.uniform(0.6, 2.0)
             ends = np.stack([start, end])
             flat = self.focal * ends[:, :2] / ends[:, 2:] + [0.0, self.shift]
+            flat *= 1.0 + self.distortion * np.sum(flat**2, axis=1, keepdims=True)
             pixels = flat * longer + middle + random.normal(0.0, self.noise_px, (2, 2))
             inside = (pixels > 0.0).all() and (pixels < np.array(SIZE) - 1.0).all()
             if ends[:, 2].min() > 1.0 and inside:

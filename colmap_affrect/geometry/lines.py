@@ -6,6 +6,10 @@ these tell the focal length, where the optical axis meets the image, and how the
 that explains most segments (:mod:`colmap_affrect.geometry.vanishing`). What is left is a likelihood
 of focal length and shift, which priors can be multiplied with.
 
+Lenses bend lines, which then meet too far out: the focal length seems too long by a tenth for a
+barrel distortion of a few per cent. So several distortions are tried, and each counts as far as
+the lines are likely with it.
+
 Lengths are in longer sides of the image, positions count from its middle, x right, y down; the
 camera looks along z. A shift is that of the principal point, down.
 """
@@ -23,6 +27,9 @@ FOCALS: Array = np.exp(np.linspace(math.log(0.4), math.log(6.0), 28))
 """Grid of focal lengths, longer sides: lenses of 14 to 216 mm for film of 36 mm; theory."""
 SHIFTS: Array = np.linspace(-0.3, 0.3, 25)
 """Grid of shifts, longer sides: view cameras go to a quarter of their plate; theory."""
+DISTORTIONS: Array = np.linspace(-0.2, 0.2, 9)
+"""Grid of radial distortions of :meth:`Segments.undistorted`: up to 5 per cent at the ends of the
+longer side; theory."""
 
 # Fewer say nothing: three directions and a focal length have 4 unknowns; theory
 MIN_NUM_SEGMENTS = 12
@@ -33,10 +40,11 @@ NUM_KEPT = 3  # of these, which are refined for each focal length; resource
 # Of the angle between planes that meet in a direction of a first frame; numeric
 MIN_SINE = 1e-3
 NUM_STEPS = 5  # of refinement without a shift; resource
-NUM_STEPS_SHIFTED = 3  # of refinement for each shift, from there; resource
+# Of refinement for each distortion, and for each shift, from there; resource
+NUM_STEPS_FROM_THERE = 3
 # Lines that count as one piece of evidence: what is built errs together; fitted
 TEMPER = 3.0
-MODEL_SIGMA = 0.04
+MODEL_SIGMA = 0.05
 """Deviation of log focal length that is left where lines are many. This and ``TEMPER`` are fitted
 by ``tests/benchmarks/lines.py``, with each scene left out in turn."""
 USUAL_FOCAL = 1.2  # longer sides: what COLMAP guesses
@@ -60,10 +68,12 @@ class LineLikelihood:
     Attributes:
         log_likelihoods: (F, S) for ``FOCALS`` and ``SHIFTS``, tempered; 0 is what chance explains.
         rotations: (F, S, 3, 3), rows are the three directions in the camera's frame.
+        distortion: the likeliest, which the rotations belong to.
     """
 
     log_likelihoods: Floats
     rotations: Floats
+    distortion: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -167,8 +177,9 @@ class Lines:
         focal = float(FOCALS[row])
         shift = float(SHIFTS[column])
         rotation = self.likelihood.rotations[row, column]
+        segments = self.segments.undistorted(self.likelihood.distortion)
         fit = VanishingFit(
-            self.segments, rotation[None], np.array([focal]), np.array([shift])
+            segments, rotation[None], np.array([focal]), np.array([shift])
         )
         evidence = float(self.likelihood.log_likelihoods[row, column])
         return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
@@ -260,18 +271,56 @@ def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood 
     """
     if len(segments) < MIN_NUM_SEGMENTS:
         return None
-    centred = _rotations_of_centred_cameras(segments, random_seed)
+    lens = _likeliest_lens(segments, random_seed)
     grid = (len(FOCALS), len(SHIFTS))
-    focals = np.repeat(FOCALS, len(SHIFTS))
-    shifts = np.tile(SHIFTS, len(FOCALS))
-    starts = np.repeat(centred, len(SHIFTS), axis=0)
-    rotations, scores = refined(segments, starts, focals, shifts, NUM_STEPS_SHIFTED)
-    log_likelihoods = scores.reshape(grid) / TEMPER
-    return LineLikelihood(log_likelihoods, rotations.reshape(*grid, 3, 3))
+    rotations, scores = refined(
+        segments.undistorted(lens.distortion),
+        np.repeat(lens.rotations, len(SHIFTS), axis=0),
+        np.repeat(FOCALS, len(SHIFTS)),
+        np.tile(SHIFTS, len(FOCALS)),
+        NUM_STEPS_FROM_THERE,
+    )
+    log_likelihoods = (scores.reshape(grid) + lens.of_others[:, None]) / TEMPER
+    return LineLikelihood(
+        log_likelihoods, rotations.reshape(*grid, 3, 3), lens.distortion
+    )
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The likeliest distortion of a camera with its axis in the middle.
+
+    Attributes:
+        distortion: of :data:`DISTORTIONS`.
+        rotations: (F, 3, 3) that explain most with it.
+        of_others: (F,) nats that the sum over all distortions adds to this one, with what is
+            known of lenses beforehand.
+    """
+
+    distortion: float
+    rotations: Floats
+    of_others: Floats
+
+
+def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
+    """Compare distortions; the frames of each are found from those of a lens without any."""
+    starts = _rotations_of_centred_cameras(segments, random_seed)
+    no_shift = np.zeros(len(FOCALS))
+    rotations = np.empty((len(DISTORTIONS), *starts.shape))
+    scores = np.empty((len(DISTORTIONS), len(FOCALS)))
+    for number, distortion in enumerate(DISTORTIONS):
+        straight = segments.undistorted(float(distortion))
+        rotations[number], scores[number] = refined(
+            straight, starts, FOCALS, no_shift, NUM_STEPS_FROM_THERE
+        )
+    best = int(scores.max(axis=1).argmax())
+    means = np.logaddexp.reduce(scores, axis=0) - math.log(len(DISTORTIONS))
+    of_others = means - scores[best]
+    return _Lens(float(DISTORTIONS[best]), rotations[best], np.asarray(of_others))
 
 
 def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Floats:
-    """Return the (F, 3, 3) rotations that explain most for each focal length, without a shift."""
+    """Return the (F, 3, 3) rotations that explain most, without a shift and a distortion."""
     starts = _first_rotations(segments, random_seed)
     focals = np.repeat(FOCALS, NUM_KEPT)
     found, scores = refined(

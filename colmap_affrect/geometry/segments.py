@@ -19,6 +19,7 @@ END_SIGMA = 0.0008  # longer sides, of the ends of a segment: about one px; theo
 # Longer sides; closer parallel segments are of one cornice or frame; judged
 SAME_LINE_DISTANCE = 0.012
 SAME_LINE_ANGLE = 0.05  # rad; judged
+NUM_UNDISTORTING_STEPS = 10  # each is five times nearer at the corners; numeric
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,18 @@ class Segments:
     def longest(self, number: int) -> "Segments":
         """Return the longest segments."""
         return Segments(self.starts[:number], self.ends[:number])
+
+    def undistorted(self, distortion: float) -> "Segments":
+        """Return the segments as a lens without distortion would show them.
+
+        A point at ``u`` from the middle is seen at ``u * (1 + distortion * |u|**2)``: COLMAP's
+        ``SIMPLE_RADIAL`` with ``k = distortion * f**2``, all in longer sides.
+        """
+        if distortion == 0.0:
+            return self
+        return Segments(
+            _undistorted(self.starts, distortion), _undistorted(self.ends, distortion)
+        )
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -97,3 +110,12 @@ class Segments:
         )
         is_same |= is_same.T
         return np.asarray(self.lengths / (is_same @ self.lengths))
+
+
+def _undistorted(seen: Floats, distortion: float) -> Floats:
+    """Return the (N, 2) points that a lens shows at (N, 2) others."""
+    points = seen
+    for _ in range(NUM_UNDISTORTING_STEPS):
+        squares = np.sum(points**2, axis=1, keepdims=True)
+        points = seen / (1.0 + distortion * squares)
+    return np.asarray(points)

@@ -446,7 +446,9 @@ class _HypothesisTest:
             PER_IMAGE_CAMERAS,
             replace(first, reconstruction=model, motion_share=share),
         )
-        self.best = with_new_images([changed, *self.best[1:]])
+        # The others, too: what is shared and what is not do not fit into one graph.
+        others = [_remade(self.per_image, mapped) for mapped in self.best[1:]]
+        self.best = with_new_images([changed, *others])
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
@@ -490,12 +492,13 @@ def _also_by(name: str, mapped: MappedModel) -> MappedModel:
 
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
     """Return models with the poses of previous ones, and all that their tracks now register."""
-    grower = search.grower(search.graph)
-    found = list[MappedModel]()
-    for mapped in previous:
-        model = grower.remake(mapped.reconstruction)
-        found.append(_also_by(AGAIN, replace(mapped, reconstruction=model)))
-    return with_new_images(found)
+    return with_new_images(_also_by(AGAIN, _remade(search, one)) for one in previous)
+
+
+def _remade(search: Search, mapped: MappedModel) -> MappedModel:
+    """Return a model with its poses, adjusted with the cameras and pairs of a search."""
+    model = search.grower(search.graph).remake(mapped.reconstruction)
+    return replace(mapped, reconstruction=model)
 
 
 def _with_per_image_cameras(

@@ -23,7 +23,9 @@ SEGMENTS = (
 )
 LIKELIHOODS = "line_log_likelihoods"  # (F, S) of focal lengths and shifts
 ROTATIONS = "line_rotations"  # (F, S, 3, 3)
-LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS)  # of an image, beside its features
+DISTORTION = "line_distortion"  # (1,), of :meth:`Segments.undistorted`
+# Of an image, beside its features
+LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS, DISTORTION)
 
 
 @documented
@@ -100,6 +102,7 @@ def line_datasets(lines: Lines) -> dict[str, NDArray[Any]]:
     if lines.likelihood is not None:
         datasets[LIKELIHOODS] = lines.likelihood.log_likelihoods.astype(np.float32)
         datasets[ROTATIONS] = lines.likelihood.rotations.astype(np.float32)
+        datasets[DISTORTION] = np.array([lines.likelihood.distortion], np.float32)
     return datasets
 
 
@@ -114,10 +117,13 @@ def lines_from_datasets(datasets: Mapping[str, NDArray[Any]]) -> Lines | None:
     log_likelihoods = datasets[LIKELIHOODS].astype(np.float64)
     if log_likelihoods.shape != (len(FOCALS), len(SHIFTS)):
         return None
+    # Files of before lines were looked at with distortions have none.
+    distortion = datasets.get(DISTORTION, np.zeros(1, np.float32))
     return Lines(
         segments,
         LineLikelihood(
             log_likelihoods=log_likelihoods,
             rotations=datasets[ROTATIONS].astype(np.float64),
+            distortion=float(distortion[0]),
         ),
     )

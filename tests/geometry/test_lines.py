@@ -8,8 +8,10 @@ from line_scenes import SIZE, Building, arch_edges, chance_edges, turn
 from numpy.testing import assert_allclose
 from strategies import Array
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry import lines as line_cameras
 from colmap_affrect.geometry.lines import (
+    DISTORTIONS,
     FOCALS,
     SHIFTS,
     LineCamera,
@@ -160,6 +162,38 @@ def test_a_building_with_the_axis_in_the_middle_is_not_called_shifted() -> None:
     free = lines.camera(line_cameras.SHIFTED_SIGMA)
     assert free is not None
     assert free.shift == pytest.approx(0.0, abs=0.06)
+
+
+def test_segments_are_undistorted_as_colmap_does() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.3, 1, 1)
+    camera.params = [1.3, 0.0, 0.0, -0.15 * 1.3**2]
+    rays = np.array([[0.3, -0.1], [-0.25, 0.2]])
+    seen = np.array([camera.img_from_cam(np.append(ray, 1.0)) for ray in rays])
+    segments = Segments(seen[:1], seen[1:]).undistorted(-0.15)
+    assert_allclose(segments.starts, 1.3 * rays[:1], atol=1e-6)
+    assert_allclose(segments.ends, 1.3 * rays[1:], atol=1e-6)
+    same = Segments(seen[:1], seen[1:])
+    assert same.undistorted(0.0) is same
+
+
+@pytest.mark.parametrize("distortion", [-0.15, 0.1])
+def test_the_focal_length_is_found_where_a_lens_bends_lines(distortion: float) -> None:
+    edges = Building(focal=1.1, distortion=distortion, num_each=40).edges(3)
+    lines = lines_of_edges(edges)
+    camera = lines.camera()
+    assert camera is not None
+    assert abs(np.log(camera.focal / 1.1)) < 0.05
+    assert lines.likelihood is not None
+    assert lines.likelihood.distortion == pytest.approx(distortion, abs=0.051)
+    explanation = lines.explanation()
+    assert explanation is not None
+    assert (explanation.kinds != CHANCE).mean() > 0.95
+
+
+def test_distortions_that_are_tried_are_those_of_lenses() -> None:
+    assert_allclose([DISTORTIONS[0], DISTORTIONS[-1]], [-0.2, 0.2])
+    assert 0.0 in DISTORTIONS
+    assert_allclose(np.diff(DISTORTIONS), 0.05)
 
 
 def test_segments_are_told_by_direction_and_the_horizon_is_where_it_is() -> None:

@@ -505,6 +505,25 @@ def focals_of(mapped: MappedModel) -> list[float]:
 
 
 @pytest.mark.long
+def test_models_of_other_places_go_on_once_photographs_have_own_cameras(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    cameras = two_places(path)
+    names = {name for record in cameras.values() for name in record.names}
+    last, other = sorted(name for name in names if name.startswith("4/"))[-2:]
+    task = MappingTask(
+        path, None, cameras=cameras, may_share=True, unmeasured_pairs=[(last, other)]
+    )
+    large, small = mapper_of("sparse").map(task, tmp_path, 0, lambda _: None)
+    assert PER_IMAGE_CAMERAS in large.hypotheses
+    for mapped in (large, small):
+        model = mapped.reconstruction
+        registered = [model.images[i] for i in model.reg_image_ids()]
+        assert len({image.camera_id for image in registered}) == len(registered)
+
+
+@pytest.mark.long
 def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     tmp_path: Path,
 ) -> None:

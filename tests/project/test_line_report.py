@@ -17,7 +17,12 @@ from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.stores import FeatureStore
 
-LINE_DATASETS = {"line_segments", "line_log_likelihoods", "line_rotations"}
+LINE_DATASETS = {
+    "line_segments",
+    "line_log_likelihoods",
+    "line_rotations",
+    "line_distortion",
+}
 
 
 def some_features(count: int) -> LocalFeatures:
@@ -35,7 +40,7 @@ def peaked(focal: float, shift: float, num_segments: int = 20) -> Lines:
     rotations = random.normal(size=(len(FOCALS), len(SHIFTS), 3, 3))
     return Lines(
         Segments.of_image(edges, SIZE),
-        LineLikelihood(60.0 - 0.5 * distances, rotations),
+        LineLikelihood(60.0 - 0.5 * distances, rotations, distortion=-0.05),
     )
 
 
@@ -61,6 +66,7 @@ def test_lines_come_back_as_written_and_stay_when_features_are_added(
         read.likelihood.log_likelihoods, lines.likelihood.log_likelihoods, rtol=1e-6
     )
     assert_allclose(read.likelihood.rotations, lines.likelihood.rotations, rtol=1e-6)
+    assert read.likelihood.distortion == pytest.approx(-0.05)
     assert len(store.read("a.png")) == 7
     without = store.lines_of(["b.png"]).get("b.png")
     assert without is not None
@@ -84,6 +90,16 @@ def test_stores_of_before_and_of_another_grid_have_no_lines(tmp_path: Path) -> N
     assert not store.lines_of(["other.png"])
     with h5py.File(store.path) as file:
         assert not LINE_DATASETS & set(file["old.png"])
+
+
+def test_lines_of_stores_of_before_have_no_distortion(tmp_path: Path) -> None:
+    store = FeatureStore(tmp_path / "features.h5")
+    store.write("a.png", some_features(3), SIZE, lines=peaked(0.9, 0.1))
+    with h5py.File(store.path, "r+") as file:
+        del file["a.png/line_distortion"]
+    read = store.lines_of(["a.png"])["a.png"]
+    assert read.likelihood is not None
+    assert read.likelihood.distortion == 0.0
 
 
 def test_what_hloc_reads_of_an_image_is_numbers_as_before(tmp_path: Path) -> None:
