@@ -24,14 +24,13 @@ if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
 
 _NAMES_OF_MODULES = {
-    # Photographs to a model: everything, one stage after the other, or the database of others.
-    "pipeline": (
+    # Photographs to a model: everything, the database of others, or one stage after the other.
+    "pipeline": ("map_database", "run"),
+    "pipeline.single_stages": (
         "choose_pairs",
         "extract",
-        "map_database",
         "map_images",
         "match",
-        "run",
         "verify",
     ),
     # What a run is made of, and what it returns.

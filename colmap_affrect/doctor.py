@@ -22,9 +22,11 @@ from colmap_affrect.colmap.tables import NoDatabaseError
 from colmap_affrect.errors import (
     AffrectError,
     DatabaseError,
+    Option,
     OptionError,
     WorkspaceError,
     such_as,
+    with_flags,
 )
 from colmap_affrect.features.weights import WEIGHT_FILES, find, is_published, remedy
 from colmap_affrect.mappers.mapping import model_folders, read_summary
@@ -132,9 +134,9 @@ def diagnose(
     weights_path = as_path_or_none(weights_path, "weights_path")
     if path is not None and not path.exists():
         wanted = "give an output folder, a COLMAP database or the folder of a model"
-        raise OptionError(f"{path}: no such file or folder; {wanted}")
+        raise OptionError("no such file or folder", where=path, advice=wanted)
     if weights_path is not None and not weights_path.is_dir():
-        raise OptionError(f"--weights {weights_path}: no such folder")
+        raise OptionError("no such folder", where=Option("weights", weights_path))
     diagnosis = Diagnosis()
     if path is not None and path.is_dir():
         _examine_folder(diagnosis, path)
@@ -194,13 +196,13 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
         newest = newest_schema_version()
         tables, problems = check_database(path)
     except NoDatabaseError as error:
-        diagnosis.add(
-            "error", path, _without_path(path, error), advice or "give a database"
-        )
+        _add_error(diagnosis, path, error, advice or "give a database")
         return False
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
-        diagnosis.add("error", path, _without_path(path, error), advice or recover)
+        _add_error(
+            diagnosis, path, error, advice or with_flags(error.advice) or recover
+        )
         return False
     quoted = shlex.quote(str(path))
     if version < newest:
@@ -249,7 +251,7 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
             in_use = isinstance(error.__cause__, TimeoutError)
             writable = "make it writable before running anything in it"
             advice = "run doctor again when it is done" if in_use else writable
-            diagnosis.add("warning", path, _without_path(path, error), advice)
+            diagnosis.add("warning", path, _fault_of(error, path), advice)
             if in_use:
                 return
         _OutputFolder(diagnosis, workspace).examine()
@@ -260,8 +262,8 @@ def _examine_model(diagnosis: Diagnosis, path: Path) -> None:
     try:
         model = read_given_model(path)
     except AffrectError as error:
-        what, _, advice = _without_path(path, error).partition("; ")
-        diagnosis.add("error", path, what, advice or "make the model again")
+        advice = with_flags(error.advice) or "make the model again"
+        _add_error(diagnosis, path, error, advice)
         return
     registered = model.num_reg_images()
     points = model.num_points3D()
@@ -290,10 +292,10 @@ class _OutputFolder:
         try:
             return reader()
         except AffrectError as error:
-            what, _, usual = _without_path(path, error).partition("; ")
             quoted = shlex.quote(str(self.workspace.path))
             restore = f"restore it, or use another --output-path than {quoted}"
-            self.diagnosis.add("error", path, what, advice or usual or restore)
+            helps = advice or with_flags(error.advice) or restore
+            _add_error(self.diagnosis, path, error, helps)
             return None
 
     def examine(self) -> None:
@@ -370,8 +372,19 @@ def _stages(diagnosis: Diagnosis, context: Context) -> list[str]:
     return done
 
 
-def _without_path(path: Path, error: Exception) -> str:
-    return (
-        str(error).removeprefix(f"{path}: ").removeprefix(f"{path}/")
-        or type(error).__name__
-    )
+def _add_error(
+    diagnosis: Diagnosis, path: Path, error: AffrectError, advice: str
+) -> None:
+    """Add what a reader says of a file as a finding."""
+    diagnosis.add("error", path, _fault_of(error, path), advice)
+
+
+def _fault_of(error: AffrectError, path: Path) -> str:
+    """Return what an error says is wrong, and with which part of what is examined."""
+    what = with_flags(error.what)
+    where = error.where
+    if not where or where == path:
+        return what
+    if isinstance(where, Path) and where.is_relative_to(path):
+        where = where.relative_to(path)
+    return f"{with_flags(where)}: {what}"

@@ -5,13 +5,13 @@ import errno
 import io
 import logging
 import os
-import re
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, TextIO
+from typing import TextIO, TypeAlias
 
 DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
@@ -29,10 +29,6 @@ logging.getLogger("colmap_affrect").addHandler(logging.NullHandler())
 MAX_REASON = 200  # characters of what a reader says; display
 # Of a line that is shown, which may name anything that is in a file; display
 MAX_LINE = 2000
-MEMORY_HINT = (
-    "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
-    "photographs, --set max_image_size_px=1600, or --device cpu where that of a GPU is full"
-)
 NO_MEMORY = (
     "insufficient memory", "out of memory", "can't allocate memory", "cannot allocate memory",
     "bad_alloc", "can't start new thread", "failed to allocate", "unable to allocate",
@@ -41,7 +37,10 @@ NO_MEMORY = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
+    """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory.
+
+    Of some only the sentence says so: they raise RuntimeError, and no number comes with it.
+    """
     text = str(error).lower()
     return isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY)
 
@@ -60,27 +59,103 @@ ARGUMENTS = {
     "tie-points": "by_hand.tie_points_path", "weights": "resources.weights_path",
 }  # fmt: skip
 """What functions call the flags whose argument has another name; a dot leads to a field."""
-# A command, whose flags stay, or a flag outside of one
-FLAG = re.compile(r"(?:colmap-affrect|colmap|pip) [^';)]*|--([a-z][a-z-]*)")
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of commands, and perhaps the value that it was given.
+
+    The command line calls it a flag, and functions an argument: where an error is shown decides.
+    """
+
+    flag: str
+    """Its name without the dashes."""
+    value: object = None
+
+    @property
+    def argument(self) -> str:
+        """What functions call it."""
+        return ARGUMENTS.get(self.flag, self.flag.replace("-", "_"))
+
+
+Words: TypeAlias = "str | Path | Option | Row | BaseException | tuple[Words, ...]"
+"""What is said: a text, or its parts in a row, with options that have a name for each who reads."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table that the user gives, or another part of a file."""
+
+    file: Words
+    """What the file is called; empty where the part says it all."""
+    part: str
+    """Such as ``line 3``."""
+
+    @property
+    def words(self) -> Words:
+        """What it is called."""
+        return (self.file, ", ", self.part) if self.file else self.part
+
+
+def with_flags(words: Words) -> str:
+    """Return what is said to who gives commands.
+
+    >>> with_flags(("use another ", Option("output-path")))
+    'use another --output-path'
+    """
+    return _in_words(words, lambda option: f"--{option.flag}")
+
+
+def with_arguments(words: Words) -> str:
+    """Return what is said to who calls functions.
+
+    >>> with_arguments((Option("mask-path", "masks"), ": no such folder"))
+    'masks.path masks: no such folder'
+    """
+    return _in_words(words, lambda option: option.argument)
+
+
+def _in_words(words: Words, name_of: Callable[[Option], str]) -> str:
+    if isinstance(words, tuple):
+        return "".join(_in_words(part, name_of) for part in words)
+    if isinstance(words, AffrectError | Row):
+        return _in_words(words.words, name_of)
+    if not isinstance(words, Option):
+        return str(words)
+    name = name_of(words)
+    return name if words.value is None else f"{name} {words.value}"
 
 
 class AffrectError(Exception):
-    """Base of all errors that the command line prints as one line."""
+    """Base of all errors that a user can act on.
+
+    As a text it is one line, which names arguments of functions. The command line names flags.
+    """
 
     exit_code = 1
-    # As the command line does; else arguments of functions
-    names_flags: ClassVar[bool] = False
+
+    def __init__(self, what: Words, *, where: Words = "", advice: Words = "") -> None:
+        """Take the parts of the line.
+
+        Args:
+            what: is wrong.
+            where: the file, folder, option or photograph in question; empty if there is none.
+            advice: what to do; empty where that is plain.
+        """
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.advice = advice
+
+    @property
+    def words(self) -> Words:
+        """The whole line."""
+        where: Words = (self.where, ": ") if self.where else ""
+        advice: Words = ("; ", self.advice) if self.advice else ""
+        return (where, self.what, advice)
 
     def __str__(self) -> str:
-        text = super().__str__()
-        return text if AffrectError.names_flags else FLAG.sub(_argument, text)
-
-
-def _argument(flag: re.Match[str]) -> str:
-    name = flag[1]
-    if name is None:  # a command, whose flags stay
-        return flag[0]
-    return ARGUMENTS.get(name, name.replace("-", "_"))
+        return with_arguments(self.words)
 
 
 class OptionError(AffrectError, ValueError):
@@ -126,19 +201,19 @@ class DepthError(AffrectError):
 class PartError(AffrectError):
     """A part of another package fails, or returns what it must not."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"{what}; use another one, or tell its authors")
+    def __init__(self, what: Words) -> None:
+        super().__init__(what, advice="use another one, or tell its authors")
 
 
 @contextmanager
 def damage(
-    path: Path, mend: str, error_class: type[AffrectError] = StoreError
+    path: Path, mend: Words, error_class: type[AffrectError] = StoreError
 ) -> Iterator[None]:
     """Say of a file that cannot be read in one line that it is damaged, and what mends it.
 
     Args:
         path: of the file that the block reads.
-        mend: what to do, the end of the line.
+        mend: what to do.
         error_class: that is raised.
 
     Raises:
@@ -154,9 +229,12 @@ def damage(
         if isinstance(error, OSError) and error.errno in OUTSIDE:
             why = os.strerror(error.errno)  # h5py says more, and in other words
             raise error_class(
-                f"{path}: cannot be read ({why}); mend that, and run the same command again"
+                f"cannot be read ({why})",
+                where=path,
+                advice="mend that, and run the same command again",
             ) from error
-        raise error_class(f"{path}: damaged ({reason(error)}); {mend}") from error
+        fault = f"damaged ({reason(error)})"
+        raise error_class(fault, where=path, advice=mend) from error
 
 
 def reason(error: BaseException) -> str:
@@ -166,11 +244,13 @@ def reason(error: BaseException) -> str:
     return one_line(" ".join(text.split()))[:MAX_REASON] or type(error).__name__
 
 
-def how_to_make_again(stage: str, folder: Path) -> str:
+def how_to_make_again(stage: str, folder: Path) -> Words:
     """Say how what a stage has left in an output folder is made again."""
     if stage == "extract":
         return (
-            "run the same 'extract' or 'run' with --overwrite (run.log has the command)"
+            "run the same 'extract' or 'run' with ",
+            Option("overwrite"),
+            " (run.log has the command)",
         )
     again = f"run 'colmap-affrect {stage} --output-path {shlex.quote(str(folder))} --overwrite'"
     return again if stage == "map" else f"{again}, then the same 'run' again"
@@ -201,9 +281,19 @@ def _escaped(character: str) -> str:
     return "".join(f"\\u{units[k : k + 2].hex()}" for k in range(0, len(units), 2))
 
 
-def not_utf_8(what: Path | str) -> str:
-    """Return what is said of a text in another encoding, as editors and shells write some."""
-    return f"{what}: is no text in UTF-8; save it as UTF-8"
+MEMORY_ADVICE: Words = (
+    "close other programs or raise the limit (ulimit -v), give smaller photographs, ",
+    Option("set", "max_image_size_px=1600"),
+    ", or ",
+    Option("device", "cpu"),
+    " where that of a GPU is full",
+)
+MEMORY_HINT: Words = ("not enough memory; ", MEMORY_ADVICE)
+
+
+def not_utf_8(where: Words) -> OptionError:
+    """Return the error of a text in another encoding, as editors and shells write some."""
+    return OptionError("is no text in UTF-8", where=where, advice="save it as UTF-8")
 
 
 def one_line(text: str) -> str:

@@ -11,8 +11,10 @@ import logging
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Literal
 
 from colmap_affrect.colmap.checks import (
     FATAL_AS_IT_IS,
@@ -21,7 +23,7 @@ from colmap_affrect.colmap.checks import (
 )
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.tables import damage_of, rows_digest
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, with_flags
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
@@ -34,7 +36,24 @@ from colmap_affrect.stages.verify import update_verified, verify_matches
 
 logger = logging.getLogger(__name__)
 
-CHANGED = "was changed since the last run"
+
+@dataclass(frozen=True)
+class Loss:
+    """Why a database is not what the last command left."""
+
+    kind: Literal["missing", "changed", "unusable"]
+    fault: str = ""  # that makes it unusable
+
+    def text(self) -> str:
+        """Return it in words."""
+        if self.kind == "missing":
+            return "is missing"
+        if self.kind == "changed":
+            return "was changed since the last run"
+        return f"cannot be used ({self.fault})"
+
+
+CHANGED = Loss("changed")
 
 
 @contextmanager
@@ -64,13 +83,13 @@ def mend_and_seal(
         _check_users_database(path)
         yield
         return
-    why = "" if discards else _why_lost(workspace)
-    if maps and why == CHANGED:
+    loss = None if discards else _loss_of(workspace)
+    if maps and loss == CHANGED:
         _take_as_it_is(context)
         yield  # the seal stays: other commands make the database again
         return
-    if why:
-        _make_again(context, why, follows=follows)
+    if loss:
+        _make_again(context, loss, follows=follows)
     workspace.seal.unlink(missing_ok=True)
     try:
         with context.graph.keep_open():
@@ -91,7 +110,7 @@ def _take_as_it_is(context: Context) -> None:
     """Have a database mapped that another program has changed."""
     workspace = context.workspace
     refuse_unusable(workspace.database, FATAL_AS_IT_IS)
-    logger.warning("%s: %s, and is mapped as it is", workspace.database, CHANGED)
+    logger.warning("%s: %s, and is mapped as it is", workspace.database, CHANGED.text())
     workspace.is_changed = True
     record_cameras(context.graph.cameras, workspace.cameras)
 
@@ -111,32 +130,31 @@ def _stamp(path: Path) -> str:
     return stamp_of(database_files(path)[:2])
 
 
-def _why_lost(workspace: Workspace) -> str:
-    """Say why the database is not what the last command left, empty if it is."""
+def _loss_of(workspace: Workspace) -> Loss | None:
+    """Return why the database is not what the last command left, None if it is."""
     path = workspace.database
     begun = workspace.started_stages
     if not path.exists():
-        return "is missing" if "verify" in begun else ""
+        return Loss("missing") if "verify" in begun else None
     sealed = list[str]()
     with suppress(OSError, UnicodeDecodeError):
         sealed = read_regular_text(workspace.seal).splitlines()
     if not begun or _stamp(path) in sealed:
-        return ""
+        return None
     try:
         fault = damage_of(path)  # of an index perhaps, which rows do not show
         if fault:
-            return f"cannot be used ({fault})"
+            return Loss("unusable", fault)
         if sealed:
-            return "" if rows_digest(path) in sealed else CHANGED
+            return None if rows_digest(path) in sealed else CHANGED
         # A command was killed: is what it wrote good?
         refuse_unusable(path, FATAL_AS_IT_IS)
     except AffrectError as error:
-        reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
-        return CHANGED if sealed else f"cannot be used ({reason})"
-    return ""
+        return CHANGED if sealed else Loss("unusable", with_flags(error.what))
+    return None
 
 
-def _make_again(context: Context, why: str, *, follows: bool) -> None:
+def _make_again(context: Context, loss: Loss, *, follows: bool) -> None:
     """Put a database aside, and make it again from what it was made from."""
     workspace = context.workspace
     begun = workspace.started_stages
@@ -151,7 +169,11 @@ def _make_again(context: Context, why: str, *, follows: bool) -> None:
         again = f"map --from-database {shlex.quote(str(kept))} --output-path OTHER"
         hint = f"; 'colmap-affrect {again}' maps what was there"
     logger.warning(
-        "%s: %s; it is made again from %s%s", workspace.database, why, source, hint
+        "%s: %s; it is made again from %s%s",
+        workspace.database,
+        loss.text(),
+        source,
+        hint,
     )
     workspace.rewind()
     context.graph.forget()

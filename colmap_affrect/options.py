@@ -39,6 +39,7 @@ from colmap_affrect.docstrings import (
 )
 from colmap_affrect.errors import (
     OptionError,
+    Words,
     clipped,
     lacks_memory,
     reason,
@@ -136,7 +137,7 @@ class Options(BaseModel):
             return cls()
         if not isinstance(options, Mapping):
             wanted = f"give {cls.__name__} or a dictionary of its fields"
-            raise OptionError(f"{argument}={options!r}: {wanted}")
+            raise OptionError(wanted, where=f"{argument}={options!r}")
         return cls.from_mapping(options, argument)
 
     @classmethod
@@ -164,11 +165,13 @@ class Options(BaseModel):
         if options is None:
             return cls(**keywords)
         if not isinstance(options, cls):
-            raise OptionError(f"{argument}={options!r}: give {cls.__name__}{hint}")
+            raise OptionError(
+                f"give {cls.__name__}{hint}", where=f"{argument}={options!r}"
+            )
         return options.changed(**keywords)
 
     @classmethod
-    def from_mapping(cls, values: Any, where: str) -> Self:
+    def from_mapping(cls, values: Any, where: Words) -> Self:
         """Build options from a mapping.
 
         Args:
@@ -179,11 +182,11 @@ class Options(BaseModel):
             OptionError: names what is wrong, and where.
         """
         if not isinstance(values, Mapping):
-            raise OptionError(f"{where}: expected options, got {values!r}")
+            raise OptionError(f"expected options, got {values!r}", where=where)
         try:
             return cls(**{str(key): value for key, value in values.items()})
         except OptionError as error:
-            raise OptionError(f"{where}: {error}") from error
+            raise OptionError(error, where=where) from error
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the options as nested dictionaries of plain values, as JSON and TOML hold them."""
@@ -291,7 +294,9 @@ class Registry(Generic[Part]):
         where = self._named(points)
         if len(points) > 1:
             raise OptionError(
-                f"{where}: several packages have that name; uninstall all but one"
+                "several packages have that name",
+                where=where,
+                advice="uninstall all but one",
             )
         try:
             part = points[0].load()
@@ -303,11 +308,13 @@ class Registry(Generic[Part]):
                 raise
             why = f"cannot be loaded ({type(error).__name__}: {reason(error)})"
             raise OptionError(
-                f"{where}: {why}; mend or uninstall that package"
+                why, where=where, advice="mend or uninstall that package"
             ) from error
         problem = self.problem(part, name)
         if problem:
-            raise OptionError(f"{where}: {problem}; mend or uninstall that package")
+            raise OptionError(
+                problem, where=where, advice="mend or uninstall that package"
+            )
         return part
 
     def _points(self, name: str) -> list[metadata.EntryPoint]:
@@ -346,7 +353,7 @@ class Registry(Generic[Part]):
                 return f"has no method '{method}'"
         return ""
 
-    def options(self, given: Any, where: str = "") -> Any:
+    def options(self, given: Any, where: Words = "") -> Any:
         """Return the options of a part.
 
         Args:
@@ -364,7 +371,7 @@ class Registry(Generic[Part]):
                 raise OptionError(f"expected options, got {given!r}")
             return self.part(str(values.get("name", self.default))).Options(**values)
         except OptionError as error:
-            raise OptionError(f"{where}: {error}" if where else str(error)) from error
+            raise OptionError(error, where=where) from error
 
     def make(self, options: PartOptions, *given: Any) -> Part:
         """Build the part that options belong to; ``given`` is what else parts of this kind take."""

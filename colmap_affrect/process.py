@@ -22,6 +22,7 @@ from colmap_affrect.errors import (
     heedless_stream,
     lacks_memory,
     say,
+    with_flags,
 )
 from colmap_affrect.parallel.subprocesses import end_with
 
@@ -221,7 +222,7 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
         if interrupts.signals or isinstance(error, KeyboardInterrupt):
             _leave()  # at once: threads may be in the middle of something long
         elif lacks_memory(error):  # already for loading what is needed
-            say(f"error: {MEMORY_HINT}")
+            say(f"error: {with_flags(MEMORY_HINT)}")
             code = 1
         else:
             raise

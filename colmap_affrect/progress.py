@@ -22,8 +22,8 @@ COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 of 8 to 1000 photographs, good for a factor of 2."""
 LEARNED_COSTS = {"image": 1.0, "pair": 1.75}
 """Of learned matching, in the same unit: as ``expected_gain.json`` has them, measured there."""
-AFTER_FIRST_MODEL = ("escalate", "learned", "pictures")
-"""How the names of the stages begin that follow the first model."""
+AFTER_FIRST_MODEL = ("escalate", "pictures")
+"""Stages that follow the first model."""
 AFTER_SHARE = 1.0
 """Of the time until the first model, the most that follows it beside learned matching; the effort
 ``normal``, as its definition has it (theory). Nothing follows a model that is sure of all: which
@@ -129,24 +129,24 @@ class Forecast:
         self._limit_s = 0.0  # of all that may follow the first model
         self._limit_told_s = clock()
 
-    def begin(self, name: str, total: int) -> None:
+    def begin(self, name: str, total: int, part: str = "") -> None:
         """Take note that a stage begins.
 
         Args:
             name: of the stage.
             total: images or pairs that it will work on.
+            part: what is done in it now; empty where that is all of it.
         """
         self._end_stage()
         self._name = name
         if name == "extract":
             self._work_began_s = self._clock()
-        known = self._ahead.pop(name, 0.0)
-        kind = name.partition(",")[0]  # "match, all features" costs what "match" does
-        unit_cost = COSTS.get(kind, 0.0)
+        known = 0.0 if part else self._ahead.pop(name, 0.0)
+        unit_cost = COSTS.get(name, 0.0)
         if name == "map":
             unit_cost = known / max(total, 1)
         self._stage = _RunningStage(unit_cost * total, total, self._clock())
-        is_after = name.startswith(AFTER_FIRST_MODEL)
+        is_after = name in AFTER_FIRST_MODEL
         if is_after and self._is_first_model:
             self._is_first_model = False
             self._ahead.clear()
@@ -314,7 +314,9 @@ class Progress:
         if isinstance(progress, cls):
             return progress
         if not (progress is None or isinstance(progress, bool)):
-            raise OptionError(f"progress={progress!r}: give True, False or a Progress")
+            raise OptionError(
+                "give True, False or a Progress", where=f"progress={progress!r}"
+            )
         shown = cls(sys.stderr)
         is_wanted = shown.takes_bars if progress is None else progress
         return shown if is_wanted else SILENT
@@ -335,19 +337,23 @@ class Progress:
             return subprocess.DEVNULL
 
     @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+    def stage(
+        self, name: str, total: int, unit: str, part: str = ""
+    ) -> Iterator[Advance]:
         """Show one stage for as long as the context lasts.
 
         Args:
             name: of the stage.
             total: how many units there are to be done.
             unit: what is counted, such as ``images``.
+            part: what is done in this stage now; empty where that is all of it.
 
         Yields:
             A function that is called with the number of units that were done since.
         """
         if self.forecast:
-            self.forecast.begin(name, total)
+            self.forecast.begin(name, total, part)
+        name = f"{name}, {part}" if part else name
         if self.stream is None or total == 0:
             yield lambda _: None
         elif self.takes_bars:
@@ -433,6 +439,7 @@ class Progress:
         voice.is_listened_to = True
 
         def listen() -> None:
+            """Speak where nothing else does."""
             while not is_over.wait(interval_s):
                 text = voice.wanted(stays=not replaces)
                 if text and replaces:
@@ -452,6 +459,7 @@ class _ReplacedLine:
     """The line of a terminal that says what is at work, until something else is printed."""
 
     def __init__(self) -> None:
+        """Begin with nothing shown."""
         self._stream: TextIO | None = None
         self._longest = 0  # characters that were shown and are not wiped
         self._lock = threading.Lock()

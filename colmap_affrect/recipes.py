@@ -12,7 +12,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.features.base import EXTRACTORS, FeatureOptions, NetworkOptions
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.depth import DepthOptions
@@ -157,7 +157,11 @@ class ExtractionOptions(Options):
             if level.rectifier.uses_depth:
                 name = level.rectifier.name
                 raise OptionError(
-                    f"rectifier {name} needs depth maps: give --depth-path FOLDER"
+                    (
+                        f"rectifier {name} needs depth maps: give ",
+                        Option("depth-path"),
+                        " FOLDER",
+                    )
                 )
 
     def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
@@ -283,7 +287,7 @@ def as_recipe(given: Any) -> Recipe:
     if isinstance(given, Mapping):
         return Recipe(**given)
     raise OptionError(
-        f"recipe={given!r}: give a Recipe, a name, a path or a dictionary"
+        "give a Recipe, a name, a path or a dictionary", where=f"recipe={given!r}"
     )
 
 
@@ -316,21 +320,27 @@ def _read_recipe(name: str) -> dict[str, Any]:
         raise OptionError(f"unknown recipe '{name}'{suggestion(name, recipe_names())}")
     path = Path(name) if is_file else recipe_folder() / f"{name}.toml"
     if path.exists() and not path.is_file():  # a pipe would be read only once
-        raise OptionError(f"recipe {path}: is not a file; give the path of a TOML file")
+        raise OptionError(
+            "is not a file",
+            where=f"recipe {path}",
+            advice="give the path of a TOML file",
+        )
     try:
         return tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
-        raise OptionError(f"recipe {name}: no such file") from error
+        raise OptionError("no such file", where=f"recipe {name}") from error
     except (
         OSError,
         ValueError,
         RecursionError,
     ) as error:  # what tomllib raises on odd files
-        raise OptionError(f"recipe {path}: cannot be read ({error})") from error
+        raise OptionError(
+            f"cannot be read ({error})", where=f"recipe {path}"
+        ) from error
 
 
 def with_settings(
-    values: Mapping[str, Any], settings: Sequence[str], flag: str = "--set"
+    values: Mapping[str, Any], settings: Sequence[str], flag: str = "set"
 ) -> dict[str, Any]:
     """Return the sections of a recipe with single options changed.
 
@@ -346,7 +356,7 @@ def with_settings(
     for setting in settings:
         key, separator, text = setting.partition("=")
         if not separator or not key.strip():
-            raise OptionError(f"{flag} {setting}: expected OPTION=VALUE")
+            raise OptionError("expected OPTION=VALUE", where=Option(flag, setting))
         *sections, option = key.strip().split(".")
         target = changed
         for section in sections:
@@ -354,7 +364,9 @@ def with_settings(
             if isinstance(inner, str):  # a part by its name alone
                 inner = {"name": inner}
             if not isinstance(inner, Mapping):
-                raise OptionError(f"{flag} {setting}: {section} is not a section")
+                raise OptionError(
+                    f"{section} is not a section", where=Option(flag, setting)
+                )
             target[section] = dict(inner)
             target = target[section]
         target[option] = _value_of(text)

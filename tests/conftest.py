@@ -21,7 +21,7 @@ from command import Call, Ended
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, with_flags
 
 settings.register_profile(
     "ci",
@@ -51,7 +51,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _flags_in_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have errors of functions name flags as those of commands; tests of functions turn it off."""
-    monkeypatch.setattr(AffrectError, "names_flags", True)
+    monkeypatch.setattr(AffrectError, "__str__", lambda error: with_flags(error.words))
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from small_comparison import IMAGE_SIZE, write_scene
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
@@ -58,7 +59,7 @@ def small_report(folder: Path) -> RunReport:
         "id": 1, "num_images": 6, "names": list(NAMES), "source": "exif", "focal_px": 200.0,
         "refined_px": 204.4, "why": "one of them",
     }  # fmt: skip
-    failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
+    failure = ImageFailure("no_image", str(folder / "photographs" / "f.png"))
     return RunReport(
         output_path=folder,
         images_total=6,
@@ -70,7 +71,7 @@ def small_report(folder: Path) -> RunReport:
         num_verified_pairs=15,
         num_pairs=15,
         stages=(
-            StageReport("extract", 6.5, 5, failures={NAMES[5]: failure}),
+            StageReport("extract", 6.5, 5, failed={NAMES[5]: failure}),
             StageReport(
                 "map",
                 3.25,

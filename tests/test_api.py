@@ -26,7 +26,13 @@ from colmap_affrect import ByHand, CameraOptions, MaskOptions, PairOptions, Reso
 from colmap_affrect.cli.flags import FLAGS
 from colmap_affrect.comparison import tables
 from colmap_affrect.comparison.method_run import CompareKeywords, CompareOptions
-from colmap_affrect.errors import ARGUMENTS, AffrectError, NoModelError, OptionError
+from colmap_affrect.errors import (
+    ARGUMENTS,
+    AffrectError,
+    NoModelError,
+    OptionError,
+    with_arguments,
+)
 from colmap_affrect.evaluation.evaluate import EvaluateKeywords, EvaluateOptions
 from colmap_affrect.features.base import EXTRACTORS, SHAPES
 from colmap_affrect.interop.align import Reference, ReferenceKeywords
@@ -51,7 +57,9 @@ PUBLIC = {name: getattr(colmap_affrect, name) for name in colmap_affrect.__all__
 @pytest.fixture(autouse=True)
 def _arguments_in_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have errors name arguments, as outside of the command line."""
-    monkeypatch.setattr(AffrectError, "names_flags", False)
+    monkeypatch.setattr(
+        AffrectError, "__str__", lambda error: with_arguments(error.words)
+    )
 
 
 def test_what_users_need_is_there_and_nothing_else_is_listed() -> None:

@@ -88,7 +88,7 @@ def test_forecasts_of_whole_runs_are_right_within_a_factor_of_two(
     first_model_s = clock.now_s
     if after == "escalation":
         forecast.expect(first_model_s)
-        found += run_stage(clock, forecast, "escalate, aliked", 10, first_model_s / 20)
+        found += run_stage(clock, forecast, "escalate", 10, first_model_s / 20)
         forecast.expect(0.0)
     found += run_stage(clock, forecast, "pictures", 20, 0.1)
     late = [whole_s for whole_s in found if whole_s > 0][len(found) // 10 :]
@@ -116,7 +116,7 @@ def test_learned_matching_has_its_own_cost_and_two_forecasts_are_told() -> None:
     learned_s = 2.0 * (10 * LEARNED_COSTS["image"] + 45 * LEARNED_COSTS["pair"])
     assert ends_s[1] - ends_s[0] == pytest.approx(learned_s, rel=0.01)
     assert forecast.text() == "50 s to 4 min left in all"
-    forecast.begin("escalate, aliked", 55)  # nothing of it is done
+    forecast.begin("escalate", 55, "aliked")  # nothing of it is done
     assert forecast.least_and_most_s() == pytest.approx((learned_s, learned_s))
 
 

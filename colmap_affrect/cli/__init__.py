@@ -30,11 +30,10 @@ def main(
     ``begin`` is called when everything is loaded, before the command begins to work. Ctrl-C goes on
     to the caller, as KeyboardInterrupt.
     """
-    errors.AffrectError.names_flags = True
     try:
         return _run(sys.argv[1:] if arguments is None else arguments, begin)
     except errors.AffrectError as error:
-        return _fail(str(error), error.exit_code)
+        return _fail(errors.with_flags(error.words), error.exit_code)
     except BrokenPipeError:  # who reads what is printed has seen enough, as head has
         return 0
     except OSError as error:
@@ -42,7 +41,8 @@ def main(
     except Exception as error:
         if not errors.lacks_memory(error):
             raise
-        return _fail(f"{errors.MEMORY_HINT}: what was done before is kept")
+        hint = errors.with_flags(errors.MEMORY_HINT)
+        return _fail(f"{hint}: what was done before is kept")
 
 
 def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
@@ -68,7 +68,7 @@ def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
 def _problem(error: OSError) -> str:
     """Say in one line what the system has refused."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename:
-        return str(cannot_write(Path(error.filename), error))
+        return errors.with_flags(cannot_write(Path(error.filename), error).words)
     return (
         f"{error.filename or _place()}: {error.strerror or error}; when that is mended, "
         "run the same command again: what was done before is kept"

@@ -26,6 +26,7 @@ from colmap_affrect.errors import (
     AffrectError,
     ImageError,
     NoModelError,
+    Option,
     OptionError,
     such_as,
 )
@@ -46,6 +47,7 @@ from colmap_affrect.interop import hdf5
 from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
+from colmap_affrect.pipeline import single_stages
 from colmap_affrect.progress import Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
@@ -175,7 +177,8 @@ def _refuse_failed_methods(comparison: Comparison, where: Path) -> None:
     """End with an error if a method failed, or none found a model."""
     failed = [method.name for method in comparison.methods if method.failed]
     if failed:
-        raise AffrectError(f"failed: {', '.join(failed)}; {where} says why")
+        names = ", ".join(failed)
+        raise AffrectError(f"failed: {names}", advice=f"{where} says why")
     if not any(seed.models for method in comparison.methods for seed in method.seeds):
         raise NoModelError("no method found a model")
 
@@ -303,7 +306,7 @@ def _print_reconstruction(
         why = "nothing in the model can be trusted: it is doubtful throughout, but written"
     if why:
         where = workspace.page if workspace.page.exists() else workspace.report
-        raise NoModelError(f"{why}; see {where}")
+        raise NoModelError(why, advice=f"see {where}")
     _refuse_failures(report.failures, options)
 
 
@@ -339,7 +342,8 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
             f"the results are of the others (--max-failures {len(names)} accepts that)"
         )
         raise ImageError(
-            f"could not read {len(names)} of the images: {', '.join(names)}; {rest}"
+            f"could not read {len(names)} of the images: {', '.join(names)}",
+            advice=rest,
         )
 
 
@@ -347,7 +351,7 @@ def inspect(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
     if not options.image.is_file():
         why = "is a folder" if options.image.is_dir() else "no such file"
-        raise OptionError(f"{options.image}: {why}; give a photograph")
+        raise OptionError(why, where=options.image, advice="give a photograph")
     photographs = Photographs(
         options.image.parent, given.over(MaskOptions(), options, "masks")
     )
@@ -369,10 +373,10 @@ def serve(options: argparse.Namespace) -> None:
     by_hand = ByHand(rejected=tuple(options.rejected), left_out=tuple(options.left_out))
     port = page_server.PORT if options.port is None else options.port
     if port > MAX_PORT:
-        raise OptionError(f"--port {port}: give a number up to {MAX_PORT}")
+        raise OptionError(f"give a number up to {MAX_PORT}", where=Option("port", port))
 
     def map_images(said: ByHand, progress: Progress) -> RunReport:
-        return pipeline.map_images(options.path, by_hand=said, progress=progress)
+        return single_stages.map_images(options.path, by_hand=said, progress=progress)
 
     page_server.serve(Workspace(options.path), by_hand, port, map_images, show)
 
@@ -385,7 +389,7 @@ def show_runs(options: argparse.Namespace) -> None:
 
 
 def show_pair(options: argparse.Namespace) -> None:
-    photographs = given.folder("--image-path", options.image_path)
+    photographs = given.folder("image-path", options.image_path)
     show(
         draw_pair(options.path, tuple(options.pair), photographs, options.picture_path)
     )
@@ -426,7 +430,7 @@ def weights(options: argparse.Namespace) -> None:
         for path in fetched.values():
             show(str(path))
     else:
-        folder = given.folder("--weights", options.weights)
+        folder = given.folder("weights", options.weights)
         for key in keys or files.WEIGHT_FILES:
             _show_weights(key, folder)
 
@@ -455,9 +459,7 @@ def _show_weights(key: str, folder: Path | None) -> None:
     path = files.find(key, folder)
     file = files.WEIGHT_FILES[key]
     if not path:
-        where = (
-            f"not found: {files.install_hint([file])}colmap-affrect weights fetch {key}"
-        )
+        where = f"not found: {', or '.join(files.commands_for([key]))}"
     elif files.is_published(key, path) is False:
         where = f"{path}, NOT the published file: unless it is your own, {files.remedy(path)}"
     else:

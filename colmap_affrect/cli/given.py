@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from colmap_affrect.cli.flags import FLAGS
 from colmap_affrect.colmap.by_hand import NOTHING, ByHand
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.mappers.existing import Extension
@@ -18,7 +18,7 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
-from colmap_affrect.pipeline import one_stage
+from colmap_affrect.pipeline.single_stages import one_stage
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
@@ -67,20 +67,24 @@ def refuse_without_database(options: argparse.Namespace) -> None:
     """Refuse what is only for the database of another program."""
     if options.image_path:
         raise OptionError(
-            "--image-path: only with --from-database; else that of extract is used"
+            ("only with ", Option("from-database")),
+            where=Option("image-path"),
+            advice="else that of extract is used",
         )
     cameras = over(CameraOptions(), options, "cameras")
     given = options.matches_path, options.match_type, options.match_list_path
     if cameras != CameraOptions() or any(given):
         raise OptionError(
-            "matches and cameras are given with --from-database; of own photographs, extract and "
-            "match take them"
+            ("matches and cameras are given with ", Option("from-database")),
+            advice="of own photographs, extract and match take them",
         )
 
 
 def extension(options: argparse.Namespace) -> Extension | None:
     if options.refine_existing and not options.extend:
-        raise OptionError("--refine-existing: only with --extend MODEL")
+        raise OptionError(
+            ("only with ", Option("extend"), " MODEL"), where=Option("refine-existing")
+        )
     if not options.extend:
         return None
     return Extension(
@@ -104,7 +108,7 @@ def recipe(options: argparse.Namespace) -> Recipe:
 
 def depth_settings(options: argparse.Namespace) -> list[str]:
     """Return the change of a recipe that --depth-path asks for."""
-    path = folder("--depth-path", options.depth_path)
+    path = folder("depth-path", options.depth_path)
     return [f"depth.path={json.dumps(str(resolved(path)))}"] if path else []
 
 
@@ -112,8 +116,10 @@ def matching(known: MatcherOptions, options: argparse.Namespace) -> MatcherOptio
     """Return a matcher with what --set changes of it; perhaps it is another one."""
     values = with_settings({"matching": known.to_mapping()}, options.set)
     if len(values) > 1:
-        raise OptionError("--set: only options of matching can be changed here")
-    changed: MatcherOptions = MATCHERS.options(values["matching"], where="--set")
+        raise OptionError(
+            "only options of matching can be changed here", where=Option("set")
+        )
+    changed: MatcherOptions = MATCHERS.options(values["matching"], where=Option("set"))
     return changed
 
 
@@ -140,7 +146,7 @@ def mapping(
     """
     given: dict[str, Any] = _seed(options)
     if options.mapper_options:
-        native = with_settings({}, options.mapper_options, "--mapper-options")
+        native = with_settings({}, options.mapper_options, "mapper-options")
         given["mapper_options"] = flat(native)
     if options.preset or options.mapper or not known:
         recipe = recipe or Recipe()
@@ -154,7 +160,7 @@ def _seed(options: argparse.Namespace) -> dict[str, int]:
 
 def resources(options: argparse.Namespace) -> Resources:
     return Resources(
-        weights_path=folder("--weights", options.weights),
+        weights_path=folder("weights", options.weights),
         device=options.device or "auto",
     )
 
@@ -162,7 +168,10 @@ def resources(options: argparse.Namespace) -> Resources:
 def folder(flag: str, path: Path | None) -> Path | None:
     """Refuse a folder to read that is not there."""
     if path and not path.is_dir():
-        raise OptionError(f"{flag} {path}: no such folder; give one that is there")
+        where = Option(flag, path)
+        raise OptionError(
+            "no such folder", where=where, advice="give one that is there"
+        )
     return path
 
 

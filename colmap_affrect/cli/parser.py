@@ -73,7 +73,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise OptionError, which ends with exit code 2."""
-        raise OptionError(f"{message}; see {self.prog} --help")
+        raise OptionError(message, advice=f"see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; names of flags may have underscores, and an unknown one is refused.

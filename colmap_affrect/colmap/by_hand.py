@@ -18,7 +18,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.masked_matches import leave_out_masked, read_painted_masks
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError, Row, Words
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.project.paths import GivenPath
@@ -75,9 +75,9 @@ class ByHand(Options):
         """
         for pair in self.rejected:
             for name in pair:
-                require_known(name, names, "--reject-pair ")
+                require_known(name, names, "reject-pair")
         for name in self.left_out:
-            require_known(name, names, "--leave-out ")
+            require_known(name, names, "leave-out")
         if not self.tie_points_path:
             return {}
         return read_marks(self.tie_points_path, names, size_of)
@@ -195,15 +195,15 @@ def require_known(name: str, names: Collection[str], option: str = "") -> None:
     Args:
         name: of a photograph.
         names: of all photographs.
-        option: that the name came by, with a space behind, for the error.
+        option: that the name came by, for the error; empty for none.
 
     Raises:
         OptionError: says which photograph may be meant.
     """
     if name not in names:
-        raise OptionError(
-            f"{option}{name}: no such photograph{suggestion(name, names)}"
-        )
+        where: Words = Option(option, name) if option else name
+        hint = suggestion(name, names)
+        raise OptionError(f"no such photograph{hint}", where=where)
 
 
 def _append_keypoints(
@@ -222,7 +222,7 @@ def _append_keypoints(
 
 
 def require_inside(
-    place: str, mark: Array, name: str, size: tuple[int, int] | None
+    place: Words, mark: Array, name: str, size: tuple[int, int] | None
 ) -> None:
     """Refuse a mark that is nowhere in its photograph.
 
@@ -238,11 +238,13 @@ def require_inside(
         OptionError: the mark is not finite, or outside.
     """
     if not np.isfinite(mark).all():
-        raise OptionError(f"{place}: x and y must be finite numbers of px")
+        raise OptionError("x and y must be finite numbers of px", where=place)
     if size and not ((mark >= -SIGMA_PX) & (mark <= np.add(size, SIGMA_PX))).all():
         raise OptionError(
-            f"{place}: {mark[0]:g}, {mark[1]:g} is outside of {name}, which is {size[0]} x "
-            f"{size[1]} px; give px of the photograph as it is stored, from its upper left corner"
+            f"{mark[0]:g}, {mark[1]:g} is outside of {name}, which is {size[0]} x "
+            f"{size[1]} px",
+            where=place,
+            advice="give px of the photograph as it is stored, from its upper left corner",
         )
 
 
@@ -263,32 +265,33 @@ def read_marks(
     Raises:
         OptionError: names the line that cannot be used.
     """
-    where = f"--tie-points {path}"
     full_names = _full_names(names)
     headers = [*chain(*COLUMNS.values()), "z"]
     marks = defaultdict[str, dict[str, Array]](dict)
     for place, row in read_table(
-        path=path, where=where, columns=headers, key="", usual=tuple(COLUMNS)
+        path, "tie-points", columns=headers, key="", usual=tuple(COLUMNS)
     ):
         point = _cell(row, "point")
         photograph = _cell(row, "photograph")
         if not point or not photograph:
-            raise OptionError(f"{place}: must name a point and a photograph")
+            raise OptionError("must name a point and a photograph", where=place)
         meant = full_names.get(photograph, [])
         if len(meant) != 1:
             hint = suggestion(photograph, names)
-            raise OptionError(f"{place}: no such photograph, {photograph}{hint}")
+            raise OptionError(f"no such photograph, {photograph}{hint}", where=place)
         name = meant[0]
         mark = _read_mark(place, row)
         require_inside(place, mark, name, size_of(name))
         before = marks[point].setdefault(name, mark)
         if not np.array_equal(before, mark):
             raise OptionError(
-                f"{place}: {point} is at {before[0]:g}, {before[1]:g} of {name} already; "
-                "leave one of both out"
+                f"{point} is at {before[0]:g}, {before[1]:g} of {name} already",
+                where=place,
+                advice="leave one of both out",
             )
     if max(map(len, marks.values()), default=0) < 2:
-        raise OptionError(f"{where}: no point is marked in two photographs")
+        where = Option("tie-points", path)
+        raise OptionError("no point is marked in two photographs", where=where)
     return marks
 
 
@@ -311,12 +314,12 @@ def _cell(row: Mapping[str, str], column: str) -> str:
     return ""
 
 
-def _read_mark(place: str, row: Mapping[str, str]) -> Array:
+def _read_mark(place: Row, row: Mapping[str, str]) -> Array:
     """Return the (2,) px of a row; OptionError names its line unless they are numbers."""
     try:
         return np.array([float(_cell(row, "x")), float(_cell(row, "y"))])
     except ValueError as error:
-        raise OptionError(f"{place}: x and y must be numbers of px") from error
+        raise OptionError("x and y must be numbers of px", where=place) from error
 
 
 def triangulated(

@@ -15,7 +15,14 @@ import pydantic
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import CHECKS
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
-from colmap_affrect.errors import OptionError, WorkspaceError, damage, how_to_make_again
+from colmap_affrect.errors import (
+    Option,
+    OptionError,
+    Row,
+    WorkspaceError,
+    damage,
+    how_to_make_again,
+)
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
 from colmap_affrect.project.atomic_files import replace_text
@@ -148,13 +155,13 @@ class GivenCamera(Options):
     """Principal point in COLMAP's px, from the corner of the image."""
     size: tuple[int, ...] = ()
     """(width, height) in px of its images; only of a model."""
-    where: str = ""
+    where: pydantic.InstanceOf[Row] = Row("", "")
     """File and line."""
 
     @cached_property
     def said(self) -> Self:
         """The same of any image: equal where the same is said."""
-        return self.changed(name="", camera="", where="")
+        return self.changed(name="", camera="", where=Row("", ""))
 
     @pydantic.model_validator(mode="after")
     def _says_all_once(self) -> Self:
@@ -198,7 +205,9 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     """
     if bool(options.focal_mm) != bool(options.film_width_mm):
         raise OptionError(
-            "--focal-mm, --film-width-mm: one without the other; give both"
+            "one without the other",
+            where=(Option("focal-mm"), ", ", Option("film-width-mm")),
+            advice="give both",
         )
     says = {"name": "", "model": options.model, "params": options.params}
     if options.focal_length_px:
@@ -207,8 +216,12 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
         says["cx"], _, says["cy"] = options.principal_point.replace(",", " ").partition(
             " "
         )
-    where = "--camera-model, --camera-params, --focal-length-px or --principal-point"
-    others = GivenCamera.from_mapping({**says, "where": "the options"}, where)
+    where = (
+        (Option("camera-model"), ", ", Option("camera-params"), ", "),
+        (Option("focal-length-px"), " or ", Option("principal-point")),
+    )
+    options_alone = Row("", "the options")
+    others = GivenCamera.from_mapping({**says, "where": options_alone}, where)
     if not options.cameras_path:
         return {"": others}
     path = Path(options.cameras_path)
@@ -219,18 +232,19 @@ def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
-    model = read_given_model(folder, "--cameras-path ", needs_poses=False)
+    model = read_given_model(folder, "cameras-path", needs_poses=False)
     cameras = {}
     for key, camera in model.cameras.items():
+        where = Row(Option("cameras-path", folder), f"camera {key}")
         says = {
             "name": "",
             "camera": str(key),
             "model": camera.model_name,
             "params": tuple(camera.params.tolist()),
             "size": (camera.width, camera.height),
-            "where": f"--cameras-path {folder}, camera {key}",
+            "where": where,
         }
-        cameras[key] = GivenCamera.from_mapping(says, says["where"])
+        cameras[key] = GivenCamera.from_mapping(says, where)
     return {image.name: cameras[image.camera_id] for image in model.images.values()}
 
 
@@ -239,18 +253,20 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     found: dict[str, GivenCamera] = {}
     labels: dict[str, GivenCamera] = {}
     columns = list(GivenCamera.model_fields.keys() - {"size", "where"})
-    for place, cells in read_table(path, f"--cameras-path {path}", columns):
+    for place, cells in read_table(path, "cameras-path", columns):
         says = {"model": others.model, **cells, "where": place}
         given = GivenCamera.from_mapping(says, place)
         if given.name in found:
-            raise OptionError(f"{place}: {given.name} is there twice")
+            raise OptionError(f"{given.name} is there twice", where=place)
         given = _completed(given, cells, others)
         found[given.name] = given
         first = labels.setdefault(given.camera, given)
         if given.camera and given.said != first.said:
             raise OptionError(
-                f"{place}: says something else of camera '{given.camera}' than "
-                f"{first.where.rpartition(', ')[2]}; give them two labels, or the same values"
+                f"says something else of camera '{given.camera}' than "
+                f"{first.where.part}",
+                where=place,
+                advice="give them two labels, or the same values",
             )
     return found
 

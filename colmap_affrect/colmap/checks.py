@@ -107,7 +107,9 @@ def refuse_unusable(
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         what = CHECKS[kind]["what"]
         advice = CHECKS[kind]["advice"].format(path=path)
-        raise DatabaseError(f"{path}: {what} ({such_as(problems[kind])}); {advice}")
+        raise DatabaseError(
+            f"{what} ({such_as(problems[kind])})", where=path, advice=advice
+        )
     if not warns:
         return
     for kind in sorted(WARNED & problems.keys()):
@@ -142,7 +144,7 @@ def check_database(
                 moved = images_with_moved_keypoints(connection, tables)
                 found.update({"keypoints-moved": moved} if moved else {})
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
-            raise DatabaseError(f"{path}: damaged ({error})") from error
+            raise DatabaseError(f"damaged ({error})", where=path) from error
     return tables, dict(found)
 
 

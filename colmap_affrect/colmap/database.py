@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES, damage_of
-from colmap_affrect.errors import DatabaseError, such_as
+from colmap_affrect.errors import DatabaseError, Option, such_as
 from colmap_affrect.geometry import conventions
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.regular_files import NotAFileError, require_regular
-from colmap_affrect.project.stores import FeatureStore
 
 logger = logging.getLogger(__name__)
 
@@ -41,12 +41,13 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         database = _open_when_free(path)
     except NotAFileError as error:
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database ({error})"
+            f"not a usable COLMAP database ({error})", where=path
         ) from error
     except RuntimeError as error:
         require_space(path, BYTES_OF_EMPTY_DATABASE)
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database, or in use by another program ({error})"
+            f"not a usable COLMAP database, or in use by another program ({error})",
+            where=path,
         ) from error
     try:
         with closing(database):
@@ -54,7 +55,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
     except RuntimeError as error:
         fault = damage_of(path)
         if fault:
-            raise DatabaseError(f"{path}: {fault}; {_mend(path)}") from error
+            raise DatabaseError(fault, where=path, advice=_mend(path)) from error
         raise cannot_write(path, error) from error
 
 
@@ -153,8 +154,9 @@ def spatial_pairs(
         logger.warning("%s: positions that do not count: %s", path, such_as(reasons))
     if len(positions) < 2:
         raise DatabaseError(
-            f"{path}: {len(positions)} images have a position (GPS in EXIF, or pose priors); "
-            "choose pairs in another way"
+            f"{len(positions)} images have a position (GPS in EXIF, or pose priors)",
+            where=path,
+            advice="choose pairs in another way",
         )
     pairs = generated_pairs(path, pycolmap.SpatialPairGenerator, options)
     return [pair for pair in pairs if wrong.keys().isdisjoint(pair)]
@@ -293,12 +295,13 @@ def write_keypoints(
     exists = database.exists_keypoints(image_id)
     if exists and count not in level_ends:
         raise DatabaseError(
-            f"image {image_id} has {count} keypoints in the database and {len(lafs)} in the "
-            "feature file; run extract again with --overwrite"
+            f"image {image_id} has {count} keypoints in the database and "
+            f"{len(lafs)} in the feature file",
+            advice=("run extract again with ", Option("overwrite")),
         )
     keypoints = colmap_keypoints(lafs)
     if not np.isfinite(keypoints).all():
-        raise DatabaseError(f"image {image_id}: keypoints are not finite")
+        raise DatabaseError("keypoints are not finite", where=f"image {image_id}")
     if exists:
         database.update_keypoints(image_id, keypoints)
     else:
@@ -356,8 +359,11 @@ def write_descriptors(
     """
     if descriptors.shape[1] != DESCRIPTOR_SIZE:
         raise DatabaseError(
-            f"descriptors have {descriptors.shape[1]} elements; COLMAP's matchers take those with "
-            f"{DESCRIPTOR_SIZE} only, leave out --database-descriptors"
+            f"descriptors have {descriptors.shape[1]} elements",
+            advice=(
+                f"COLMAP's matchers take those with {DESCRIPTOR_SIZE} only, leave out ",
+                Option("database-descriptors"),
+            ),
         )
     is_signed = descriptors.min(initial=0.0) < 0.0
     shift = SIGNED_SHIFT if is_signed else 0.0
@@ -461,6 +467,7 @@ def _check_indices(
     largest = indices.max(axis=0)
     if indices.min() < 0 or (largest >= counts).any():
         raise DatabaseError(
-            f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
-            f"(largest {largest.tolist()}, keypoints {counts}); match them again"
+            f"matches of images {image_id1}, {image_id2} point at keypoints that do "
+            f"not exist (largest {largest.tolist()}, keypoints {counts})",
+            advice="match them again",
         )

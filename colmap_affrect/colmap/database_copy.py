@@ -54,8 +54,10 @@ def refuse_newer(path: Path) -> int:
     newest = newest_schema_version()
     if version > newest:
         raise DatabaseError(
-            f"{path}: was made by a newer COLMAP (schema {version}, pycolmap "
-            f"{pycolmap.__version__} knows {newest}); update pycolmap"
+            f"was made by a newer COLMAP (schema {version}, pycolmap "
+            f"{pycolmap.__version__} knows {newest})",
+            where=path,
+            advice="update pycolmap",
         )
     return version
 
@@ -86,7 +88,9 @@ def copy_database(
             or has some of these problems.
     """
     if target.exists():
-        raise DatabaseError(f"{target}: exists already; it is not overwritten")
+        raise DatabaseError(
+            "exists already", where=target, advice="it is not overwritten"
+        )
     version = refuse_newer(source)
     if refused:
         refuse_unusable(source, refused)
@@ -118,8 +122,9 @@ def _one_line(source: Path, target: Path) -> Iterator[None]:
         yield
     except sqlite3.IntegrityError as error:
         raise DatabaseError(
-            f"{source}: has rows that COLMAP's tables cannot hold ({error}); import its images "
-            "again into a new database"
+            f"has rows that COLMAP's tables cannot hold ({error})",
+            where=source,
+            advice="import its images again into a new database",
         ) from error
     except sqlite3.OperationalError as error:
         if error.sqlite_errorcode in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE):

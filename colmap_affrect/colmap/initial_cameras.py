@@ -23,7 +23,7 @@ from colmap_affrect.colmap.cameras import (
     read_given_cameras,
 )
 from colmap_affrect.colmap.database import camera_matrix
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError, Row, Words
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
@@ -136,8 +136,9 @@ class InitialCameras:
         size = self.size(name)
         if given.size and size and size != given.size:
             raise OptionError(
-                f"{given.where}: is {_px(given.size)}, {name} is {_px(size)}; give "
-                "photographs of that size, or leave the model out"
+                f"is {_px(given.size)}, {name} is {_px(size)}",
+                where=given.where,
+                advice="give photographs of that size, or leave the model out",
             )
 
     def _several_sizes(self, names: Sequence[str]) -> list[StageWarning]:
@@ -172,14 +173,22 @@ class InitialCameras:
         params = self.given(first).params
         if params and params == self.given(second).params:
             raise OptionError(
-                f"{self._who(first)}: {both}, and the given parameters are of one size; give "
-                "those of each size as params in a table (--cameras-path), or leave them out"
+                f"{both}, and the given parameters are of one size",
+                where=self._who(first),
+                advice=(
+                    "give those of each size as params in a table (",
+                    Option("cameras-path"),
+                    "), or leave them out",
+                ),
             )
 
-    def _who(self, name: str) -> str:
+    def _who(self, name: str) -> Words:
         """Return what says that an image shares a camera with others."""
         mode = self.options.mode
-        return self.given(name).where if mode == "auto" else f"--camera-mode {mode}"
+        if mode == "auto":
+            row: Row = self.given(name).where
+            return row
+        return Option("camera-mode", mode)
 
     def check_known(self, names: Sequence[str], where: str) -> None:
         """Refuse cameras of images that are not known, unless a model has more images.
@@ -200,7 +209,7 @@ class InitialCameras:
         is_model = any(given.size for given in self._given.values())
         if unknown and not (is_model and self._given.keys() & set(names)):
             given = self.given(unknown[0])
-            raise OptionError(f"{given.where}: {unknown[0]} is not in {where}")
+            raise OptionError(f"{unknown[0]} is not in {where}", where=given.where)
 
     def replace_cameras(self, database: pycolmap.Database) -> dict[int, CameraRecord]:
         """Write what the user gives into the cameras that images of a database have.
@@ -232,8 +241,8 @@ class InitialCameras:
         size = (before.width, before.height)
         if given.size and tuple(given.size) != size:
             raise OptionError(
-                f"{given.where}: is {_px(given.size)}, and {names[0]} is "
-                f"{_px(size)} in the database"
+                f"is {_px(given.size)}, and {names[0]} is {_px(size)} in the database",
+                where=given.where,
             )
         camera, record = self.camera(sorted(names), size)
         if not given.params and given.model == CameraOptions().model:
@@ -248,9 +257,13 @@ class InitialCameras:
         for other in named:
             if other.said != first.said:
                 raise OptionError(
-                    f"{other.where}: says something else than {first.where.rpartition(', ')[2]}, "
-                    f"and --camera-mode {self.options.mode} lets these images share a camera; "
-                    "leave that out, or give both the same"
+                    (
+                        f"says something else than {first.where.part}, and ",
+                        Option("camera-mode", self.options.mode),
+                        " lets these images share a camera",
+                    ),
+                    where=other.where,
+                    advice="leave that out, or give both the same",
                 )
         return first
 

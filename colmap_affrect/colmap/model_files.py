@@ -145,7 +145,7 @@ def _read_records(path: Path) -> list[Any]:
     return records
 
 
-def _mend(folder: Path) -> str:
+def _mend(folder: Path) -> errors.Words:
     """Say how a model is made again."""
     if (folder.parent.parent / "config.toml").exists():
         return errors.how_to_make_again("map", folder.parent.parent)
@@ -175,9 +175,13 @@ def _require_digests(folder: Path, known: Mapping[str, str]) -> None:
     for name in RECORDS:
         if known.get(name) != now.get(name):
             raise errors.StoreError(
-                f"{folder / name}: is not as it was written (see {SUMMARY} in its folder); if you "
-                f"have edited the model, copy it to a folder of its own without {SUMMARY} and use "
-                f"that; else {_mend(folder)}"
+                f"is not as it was written (see {SUMMARY} in its folder)",
+                where=folder / name,
+                advice=(
+                    "if you have edited the model, copy it to a folder of its own without "
+                    f"{SUMMARY} and use that; else ",
+                    _mend(folder),
+                ),
             )
 
 
@@ -237,7 +241,7 @@ def read_given_model(
 
     Args:
         folder: of the model, or the output folder of a run, whose largest model is read.
-        option: that it came by, with a space behind, for errors.
+        option: that it came by, for errors, as :class:`errors.Option` names it; empty for none.
         needs_poses: whether its poses are to be used; else only its cameras and names.
 
     Raises:
@@ -247,9 +251,11 @@ def read_given_model(
             points or cameras that are not finite.
     """
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
+    where: errors.Words = errors.Option(option, folder) if option else folder
     if not folder.is_dir():
-        raise errors.OptionError(f"{option}{folder}: no such folder; {wanted}")
+        raise errors.OptionError("no such folder", where=where, advice=wanted)
     folder = model_folder(folder)
+    where = errors.Option(option, folder) if option else folder
     for path in sorted(folder.glob("*.[bt][ix][nt]")):
         with errors.damage(path, wanted):
             require_regular(path)
@@ -259,12 +265,12 @@ def read_given_model(
         with errors.damage(folder, _mend(folder)):
             model = pycolmap.Reconstruction(folder)
     else:
-        model = _read_text(folder, option, wanted)
+        model = _read_text(folder, where, wanted)
     fault = _mixed_up(model)
     if not fault and not is_ours:
         fault = why_unusable(model, needs_poses=needs_poses)
     if fault:
-        raise errors.StoreError(f"{option}{folder}: {fault}; {_mend(folder)}")
+        raise errors.StoreError(fault, where=where, advice=_mend(folder))
     return model
 
 
@@ -277,14 +283,17 @@ def _mixed_up(model: pycolmap.Reconstruction) -> str:
     return "damaged (its images and points are not of one model)"
 
 
-def _read_text(folder: Path, option: str, wanted: str) -> pycolmap.Reconstruction:
+def _read_text(
+    folder: Path, where: errors.Words, wanted: str
+) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(folder)
     except errors.DAMAGE as error:
         if errors.lacks_memory(error):
             raise
-        why = f"not a COLMAP model; {wanted} ({errors.reason(error)})"
-        raise errors.OptionError(f"{option}{folder}: {why}") from error
+        advice = f"{wanted} ({errors.reason(error)})"
+        fault = "not a COLMAP model"
+        raise errors.OptionError(fault, where=where, advice=advice) from error
 
 
 def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
@@ -331,7 +340,7 @@ def _faulty_points(model: pycolmap.Reconstruction) -> str:
     return ""
 
 
-def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
+def refuse_panoramas(model: pycolmap.Reconstruction, what: errors.Words) -> None:
     """Refuse a model with cameras that look all around, which have no focal length.
 
     Args:
@@ -341,8 +350,10 @@ def refuse_panoramas(model: pycolmap.Reconstruction, what: str) -> None:
     for camera_id, camera in sorted(model.cameras.items()):
         if not len(camera.focal_length_idxs()):
             raise errors.OptionError(
-                f"{what}: camera {camera_id} looks all around ({camera.model_name}) and has no "
-                "focal length; use the model of perspective views of the panoramas"
+                f"camera {camera_id} looks all around ({camera.model_name}) and has no "
+                "focal length",
+                where=what,
+                advice="use the model of perspective views of the panoramas",
             )
 
 

@@ -10,7 +10,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError, Words
 from colmap_affrect.options import flat, suggestion
 
 # COLMAP starts them all, and waits for ever for those that it cannot have
@@ -18,9 +18,9 @@ MAX_NUM_THREADS = 1024
 
 Plain = bool | int | float | str
 
-OWNED = {
+OWNED: Mapping[str, Words] = {
     "image_path": "it is the one that extract was given",
-    "random_seed": "use --random-seed",
+    "random_seed": ("use ", Option("random-seed")),
 }
 """Options, in any section, that are set by other means."""
 
@@ -60,7 +60,10 @@ def set_values(options: Any, values: Mapping[str, Any]) -> None:
 
 
 def resolve(
-    options: Any, given: Mapping[str, Any], flag: str, owned: Mapping[str, str] = OWNED
+    options: Any,
+    given: Mapping[str, Any],
+    option: Words,
+    owned: Mapping[str, Words] = OWNED,
 ) -> dict[str, Plain]:
     """Set single values of pycolmap's options.
 
@@ -68,7 +71,7 @@ def resolve(
         options: of pycolmap, which are changed.
         given: values, which may be text, by key; sections may be left out of a key where its name
             exists once.
-        flag: that errors begin with.
+        option: that they came by, for errors.
         owned: what to do instead, by the names of options that cannot be changed so.
 
     Returns:
@@ -78,35 +81,37 @@ def resolve(
         OptionError: names a key that is unknown, ambiguous or ``owned``, or has a wrong value.
     """
     known = flat_values(options)
-    keys = {_full_key(text, known, flag): text for text in given}
+    keys = {_full_key(text, known, option): text for text in given}
     plain = _plain_values(options)
     for key, text in keys.items():
-        where = f"{flag} {text}"
+        where = (option, f" {text}")
         kind = type(known[key])
         name = _name(key)
         if name in owned:
-            raise OptionError(f"{where}: cannot be changed here; {owned[name]}")
+            raise OptionError("cannot be changed here", where=where, advice=owned[name])
         if key not in plain:
             raise OptionError(
-                f"{where}: cannot be given, it is of type {kind.__name__}"
+                f"cannot be given, it is of type {kind.__name__}", where=where
             )
         try:
             parsed = _parsed(given[text], known[key])
-            _check_num_threads(name, parsed, where)
+            _check_num_threads(name, parsed, (option, f" {text}={parsed}"))
             set_values(options, {key: parsed})
         except OptionError:
             raise
         except (TypeError, ValueError, RuntimeError) as error:
             expected = _expected(kind)
-            raise OptionError(f"{where}={given[text]}: expected {expected}") from error
+            raise OptionError(
+                f"expected {expected}", where=(option, f" {text}={given[text]}")
+            ) from error
     taken = _plain_values(options)
     return {key: taken[key] for key in keys}
 
 
-def _check_num_threads(name: str, value: Any, where: str) -> None:
+def _check_num_threads(name: str, value: Any, where: Words) -> None:
     if name == "num_threads" and value > MAX_NUM_THREADS:
         raise OptionError(
-            f"{where}={value}: at most {MAX_NUM_THREADS}, or -1 for all cores"
+            f"at most {MAX_NUM_THREADS}, or -1 for all cores", where=where
         )
 
 
@@ -150,15 +155,19 @@ def _name(key: str) -> str:
     return key.rpartition(".")[2]
 
 
-def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
+def _full_key(text: str, known: Mapping[str, Any], option: Words) -> str:
     if text in known:
         return text
     found = [key for key in known if _name(key) == text]
     if len(found) > 1:
         raise OptionError(
-            f"{flag} {text}: exists in several sections; give {' or '.join(found)}"
+            "exists in several sections",
+            where=(option, f" {text}"),
+            advice=f"give {' or '.join(found)}",
         )
     if not found:
         hint = suggestion(text, [*known, *map(_name, known)])
-        raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
+        raise OptionError(
+            f"pycolmap has no such option{hint}", where=(option, f" {text}")
+        )
     return found[0]

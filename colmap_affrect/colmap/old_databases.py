@@ -9,11 +9,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import fill_descriptors, open_database
 from colmap_affrect.colmap.database_copy import copy_database, read_names
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, Option, OptionError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.paths import PathLike, as_path
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 MAPPER_OPTIONS = (
@@ -51,7 +51,9 @@ def export_database(
     path = as_path(path, "path")
     workspace = Workspace(path) if path.is_dir() else Workspace.beside(path)
     if descriptors and not workspace.features.exists():
-        raise OptionError(f"--descriptors: {path} is no output folder with features.h5")
+        raise OptionError(
+            f"{path} is no output folder with features.h5", where=Option("descriptors")
+        )
     features = FeatureStore(workspace.features) if descriptors else None
     return _write(workspace.database, as_path(database_path, "database_path"), features)
 
@@ -80,8 +82,10 @@ def _refuse_new_models(database: pycolmap.Database, source: Path) -> None:
     for camera in database.read_all_cameras():
         if int(camera.model) > LAST_MODEL:
             raise DatabaseError(
-                f"{source}: camera {camera.camera_id} is of model {camera.model.name}, which "
-                "COLMAP 3.8 does not know; extract with another --camera-model"
+                f"camera {camera.camera_id} is of model {camera.model.name}, which "
+                "COLMAP 3.8 does not know",
+                where=source,
+                advice=("extract with another ", Option("camera-model")),
             )
 
 

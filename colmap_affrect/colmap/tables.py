@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, OptionError, with_arguments
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import (
     NotAFileError,
@@ -56,12 +56,14 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     except DAMAGED as error:
         if journal.exists() and read_regular(journal)[:8] == HOT_JOURNAL:
             raise DatabaseError(
-                f"{path}: a program that was writing to it was killed, or is still at work, and "
-                f"{journal.name} undoes the half of it; wait, or open it once with a program that "
-                f"may write, e.g. sqlite3 {path.name} .tables"
+                "a program that was writing to it was killed, or is still at work, and "
+                f"{journal.name} undoes the half of it",
+                where=path,
+                advice="wait, or open it once with a program that may write, e.g. sqlite3 "
+                f"{path.name} .tables",
             ) from error
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database ({error})"
+            f"not a usable COLMAP database ({error})", where=path
         ) from error
 
 
@@ -74,7 +76,8 @@ def _require_sqlite(path: Path) -> None:
         return  # SQLite says why
     if start and start != MAGIC and not MAGIC.startswith(start):
         raise NoDatabaseError(
-            f"{path}: not a usable COLMAP database (it does not begin as files of SQLite do)"
+            "not a usable COLMAP database (it does not begin as files of SQLite do)",
+            where=path,
         )
 
 
@@ -84,9 +87,13 @@ def _require_regular_files(paths: Sequence[Path]) -> None:
         try:
             require_regular(path)
         except NotAFileError as error:
-            raise OptionError(f"{path}: {error}; give a COLMAP database") from error
+            raise OptionError(
+                error, where=path, advice="give a COLMAP database"
+            ) from error
     if not paths[0].is_file():
-        raise OptionError(f"{paths[0]}: no such file; give a COLMAP database")
+        raise OptionError(
+            "no such file", where=paths[0], advice="give a COLMAP database"
+        )
 
 
 def _require_tables(connection: sqlite3.Connection, path: Path) -> None:
@@ -95,7 +102,7 @@ def _require_tables(connection: sqlite3.Connection, path: Path) -> None:
     missing = TABLES - {name for (name,) in rows}
     if missing:
         raise DatabaseError(
-            f"{path}: not a COLMAP database (it has no table {min(missing)})"
+            f"not a COLMAP database (it has no table {min(missing)})", where=path
         )
 
 
@@ -216,7 +223,7 @@ def require_intact_pages(connection: sqlite3.Connection, path: Path) -> None:
     """Refuse a database that SQLite finds damaged, perhaps in an index that no row shows."""
     (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if verdict != "ok":
-        raise DatabaseError(f"{path}: damaged ({str(verdict).splitlines()[-1]})")
+        raise DatabaseError(f"damaged ({str(verdict).splitlines()[-1]})", where=path)
 
 
 def damage_of(path: Path) -> str:
@@ -225,7 +232,7 @@ def damage_of(path: Path) -> str:
         with open_read_only(path) as connection:
             require_intact_pages(connection, path)
     except (DatabaseError, OptionError) as error:
-        return str(error).removeprefix(f"{path}: ")
+        return with_arguments(error.what)
     return ""
 
 

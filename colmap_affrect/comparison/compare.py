@@ -21,7 +21,7 @@ from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, pose_scores
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.worker import run_alone
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import digest_of, takes_fields_of
@@ -194,14 +194,15 @@ def _checked_inputs(
     """Return the photographs and their names; refuse what cannot work before anything is done."""
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
         raise OptionError(
-            f"--seeds {','.join(map(str, options.seeds))}: give different seeds"
+            "give different seeds",
+            where=Option("seeds", ",".join(map(str, options.seeds))),
         )
     options.resources.require_device()
     for seed in options.seeds:
         options.verification.changed(random_seed=seed)
     if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
         raise OptionError(
-            "pairs: a comparison matches all pairs, or those of match_list_path"
+            "a comparison matches all pairs, or those of match_list_path", where="pairs"
         )
     inputs = options.inputs(image_path)
     inputs.check()
@@ -209,7 +210,7 @@ def _checked_inputs(
     if len(names) < 2:
         only = f"only {names[0] if names else 'no image'} to use"
         raise AffrectError(
-            f"{image_path}: {only}; a comparison needs at least two images"
+            only, where=image_path, advice="a comparison needs at least two images"
         )
     inputs.check_names(names)
     return inputs, names
@@ -257,8 +258,10 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
     truth = read_poses(path)
     if not truth.keys() & set(names):
         raise AffrectError(
-            f"{path}: shares no image name with the photographs (it has {min(truth)}, they have "
-            f"{min(names)}); rename the images of one of them"
+            f"shares no image name with the photographs (it has {min(truth)}, they "
+            f"have {min(names)})",
+            where=path,
+            advice="rename the images of one of them",
         )
     return truth
 

@@ -32,8 +32,8 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.errors import AffrectError, ConflictError, damage
-from colmap_affrect.escalation.climb import climb
+from colmap_affrect.errors import AffrectError, ConflictError, Option, damage
+from colmap_affrect.escalation.map_and_rematch import map_and_rematch
 from colmap_affrect.images import reading
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -43,6 +43,7 @@ from colmap_affrect.pairs.lists import Pair, read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.progress import SILENT, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_bytes, replace_text
+from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.outputs import new_results, remove_own, temporary_folder
 from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.project.reasons import texts_of
@@ -68,7 +69,7 @@ def extract_sift(
     image_path: Path,
     image_names: Sequence[str],
     masks: MaskOptions,
-) -> dict[str, str]:
+) -> dict[str, ImageFailure]:
     """Extract SIFT features of images of a database by COLMAP's default options.
 
     Features that are there are kept. Images and masks that claim more pixels than photographs have
@@ -84,7 +85,7 @@ def extract_sift(
         The images without features, with the reason.
     """
     photographs = Photographs(image_path, masks)
-    failures = {}
+    failures = dict[str, ImageFailure]()
     usable = list[str]()
     for name in image_names:
         why = photographs.why_impossible(name)
@@ -104,7 +105,7 @@ def extract_sift(
     with open_database(database_path) as database:
         for name in usable:
             if not database.exists_keypoints(ids[name]):
-                failures[name] = "COLMAP cannot read it or its mask"
+                failures[name] = ImageFailure("unread_by_colmap")
     return failures
 
 
@@ -145,7 +146,9 @@ def match_sift(database_path: Path, pairs: Sequence[Pair] | None) -> None:
     for name in itertools.chain.from_iterable(pairs):
         if " " in name:
             raise AffrectError(
-                f"{name}: COLMAP matches no listed names with spaces; rename it"
+                "COLMAP matches no listed names with spaces",
+                where=name,
+                advice="rename it",
             )
     lines = [f"{first} {second}\n" for first, second in pairs]
     with temporary_folder(database_path.parent) as folder:
@@ -248,14 +251,21 @@ class MethodRun:
             # Verification with this seed decides what is matched again.
             asked["seed"] = self.options.seeds[0]
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
-        with damage(record, "use --overwrite to redo the methods that are named"):
+        mend = ("use ", Option("overwrite"), " to redo the methods that are named")
+        with damage(record, mend):
             known = json.loads(read_regular(record)) if record.exists() else {}
             difference = first_difference(known, asked)
         if folder.exists() and difference:
             raise ConflictError(
-                f"{folder}: {self.method.label} was run there with {difference}; use "
-                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
-                "or another --output-path"
+                f"{self.method.label} was run there with {difference}",
+                where=folder,
+                advice=(
+                    "use ",
+                    Option("overwrite"),
+                    " to redo the methods that are named, another name (NAME=RECIPE), or "
+                    "another ",
+                    Option("output-path"),
+                ),
             )
         self.workspace.begin()
         replace_text(record, json.dumps(asked, indent=1))
@@ -269,7 +279,8 @@ class MethodRun:
                 failures = self._match_recipe(watch)
             else:
                 failures = self._match_sift(watch)
-            self.keep(failures=failures, wall_s=watch.seconds)
+            texts = {name: why.text() for name, why in failures.items()}
+            self.keep(failures=texts, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
             if seed not in done:
@@ -285,7 +296,7 @@ class MethodRun:
             self.workspace.path / "result.json", RESULT_JSON.dump_json(result, indent=1)
         )
 
-    def _match_sift(self, watch: Stopwatch) -> dict[str, str]:
+    def _match_sift(self, watch: Stopwatch) -> dict[str, ImageFailure]:
         """Extract and match as COLMAP does; return why images cannot be used."""
         inputs = self.options.inputs(self.image_path)
         names = inputs.names()
@@ -316,7 +327,7 @@ class MethodRun:
             advance(num_pairs)
         return failures
 
-    def _match_recipe(self, watch: Stopwatch) -> dict[str, str]:
+    def _match_recipe(self, watch: Stopwatch) -> dict[str, ImageFailure]:
         """Extract, match and match again by a recipe; return why images cannot be used."""
         context = Context(
             workspace=self.workspace,
@@ -326,9 +337,10 @@ class MethodRun:
         )
         inputs = self.options.inputs(self.image_path)
         recipe = self.method.recipe or Recipe()
-        self.keep(lacks=context.resources.how_to_complete(recipe.extraction))
+        commands = context.resources.commands_to_complete(recipe.extraction)
+        self.keep(lacks=", or ".join(commands))
         with watch.step("extract"):
-            failures = extract(context, inputs, recipe).failures
+            failures = extract(context, inputs, recipe).failed
         choose_pairs(context, self.options.pairs)
         with watch.step("match"):
             match(context)
@@ -338,7 +350,7 @@ class MethodRun:
             verify_matches(replace(context, progress=SILENT), verification)
             mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
             with watch.step("escalate"):
-                climb(context, mapper, recipe)
+                map_and_rematch(context, mapper, recipe)
         return failures
 
     def _run_seed(self, seed: int) -> SeedResult:

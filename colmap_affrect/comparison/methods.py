@@ -90,7 +90,7 @@ def parse_methods(
     for label, count in Counter(method.label for method in methods).items():
         if count > 1:
             other = "give one another name, as in NAME=RECIPE"
-            raise OptionError(f"two methods are called '{label}'; {other}")
+            raise OptionError(f"two methods are called '{label}'", advice=other)
     return tuple(methods)
 
 
@@ -124,7 +124,9 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     head, _, settings = text.partition(":")
     label, _, name = head.rpartition("=")
     if label in SIFT_SUMMARIES:
-        raise OptionError(f"{text}: '{label}' is COLMAP's; choose another name")
+        raise OptionError(
+            f"'{label}' is COLMAP's", where=text, advice="choose another name"
+        )
     if not name.endswith(".toml") and name not in recipe_names():
         known = [*SIFT_SUMMARIES, *recipe_names()]
         raise OptionError(f"unknown method '{name}'{suggestion(name, known)}")

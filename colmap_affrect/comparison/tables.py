@@ -33,7 +33,7 @@ def table(comparison: Comparison) -> dict[str, list[str]]:
     Numbers are means over the seeds, with the range where seeds differ.
     """
     methods = comparison.finished
-    columns: dict[str, list[str]] = {}
+    columns = dict[str, list[str]]()
     for key, measure in MEASURES.items():
         spans = [method.span(key) for method in methods]
         if any(spans):
@@ -72,18 +72,17 @@ def number_text(number: float, digits: int) -> str:
 
 def verdict(comparison: Comparison) -> list[str]:
     """Return what the numbers mean, the most important paragraph first."""
+    paragraphs = [*headline(comparison), *notes(comparison)]
     ending = conclusion(comparison)
-    return [*headline(comparison), *notes(comparison), *filter(None, [ending])]
+    return [*paragraphs, ending] if ending else paragraphs
 
 
 def conclusion(comparison: Comparison) -> str:
     """Answer in a sentence whether our features are worth it; empty where nothing compares."""
-    finished = {method.name: method for method in comparison.finished}
-    colmap = finished.get(SIFT_COLMAP) or finished.get(SIFT)
-    ours = [one for name, one in finished.items() if name not in SIFT_SUMMARIES]
-    if not colmap or not ours:
+    colmap = _best_of_colmap(comparison)
+    best = _best_of_ours(comparison)
+    if not colmap or not best:
         return ""
-    best = ours[0]  # of those that finished, the best one is the first
     how = "correctly" if comparison.has_ground_truth else "surely"
     whose = "COLMAP" if colmap.name == SIFT_COLMAP else "COLMAP's SIFT with our mapper"
     difference = best.trusted.mean - colmap.trusted.mean
@@ -101,6 +100,20 @@ def conclusion(comparison: Comparison) -> str:
         f"{whose} does as well here: {num_trusted} placed {how} by it and by {best.name}, "
         f"which takes {times}."
     )
+
+
+def _best_of_colmap(comparison: Comparison) -> MethodResult | None:
+    """Return what our features are compared with: COLMAP as it is, else its SIFT."""
+    finished = {method.name: method for method in comparison.finished}
+    return finished.get(SIFT_COLMAP) or finished.get(SIFT)
+
+
+def _best_of_ours(comparison: Comparison) -> MethodResult | None:
+    """Return the best method with our features, None if none finished."""
+    for method in comparison.finished:  # the best one first
+        if method.name not in SIFT_SUMMARIES:
+            return method
+    return None
 
 
 def _times(seconds: float, others_s: float) -> str:
@@ -193,16 +206,15 @@ def _registered_alone(comparison: Comparison) -> list[str]:
 def summary(comparison: Comparison) -> str:
     """Return the table of methods, and the verdict under it."""
     columns = table(comparison)
-    rows = [["method", *columns]]
-    for number, method in enumerate(comparison.finished):
-        rows.append([method.name, *(cells[number] for cells in columns.values())])
-    rows += [[method.name, "failed"] for method in comparison.methods if method.failed]
+    names = [method.name for method in comparison.finished]
+    rows = [["method", *columns], *zip(names, *columns.values(), strict=True)]
+    for method in comparison.methods:
+        if method.failed:
+            rows.append([method.name, "failed"])
     lines = [aligned(rows), "", *headline(comparison)]
-    for paragraph in notes(comparison):
-        lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
-    ending = conclusion(comparison)
-    if ending:
-        lines += ["", *textwrap.wrap(ending, WIDTH, break_on_hyphens=False)]
+    for paragraph in (*notes(comparison), conclusion(comparison)):
+        if paragraph:
+            lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 
 from colmap_affrect.comparison.method_run import MethodRun
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, with_flags
 from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.progress import Progress
 
@@ -70,7 +70,7 @@ def main() -> None:
         with run.workspace.locked(), run.progress.never_silent():
             run.run()
     except AffrectError as error:
-        run.keep(failed=str(error))
+        run.keep(failed=with_flags(error.words))
     except Exception as error:
         logging.exception("failed")
         run.keep(failed=f"{type(error).__name__}: {error}")

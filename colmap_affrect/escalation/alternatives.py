@@ -28,10 +28,10 @@ from colmap_affrect.mappers.mapping import (
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.match_state import LearnedModels, Worth
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import MatchStore, PairMatches
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
@@ -40,20 +40,20 @@ from colmap_affrect.stages.verify import verify_matches
 SCORE = "score.json"  # in the folder of the best models
 
 
-def score(models: Sequence[ModelSummary]) -> float:
+def num_right_poses(models: Sequence[ModelSummary]) -> float:
     """Return how many poses relative to a first image are expected to be right.
 
     >>> model = ModelSummary(("a", "b", "c"), 9, 2.0, 0.5, {"a": 1.0, "b": 1.0, "c": 0.5})
-    >>> score([model]), score([model, model]), score([])
+    >>> num_right_poses([model]), num_right_poses([model, model]), num_right_poses([])
     (1.5, 3.0, 0.0)
     """
     expected = (sum(model.probabilities.values()) - 1.0 for model in models)
     return sum((max(0.0, number) for number in expected), 0.0)
 
 
-def present_score(context: Context) -> float:
-    """Return the score of the models that are there."""
-    return score(read_summaries(context.workspace.sparse))
+def num_right_poses_now(context: Context) -> float:
+    """Return the same of the models that are there."""
+    return num_right_poses(read_summaries(context.workspace.sparse))
 
 
 def _set_of(context: Context) -> str:
@@ -96,7 +96,7 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
     names = set(context.features.names()).difference(context.by_hand.left_out)
     is_sure = bool(found) and names.issubset(found[0].sure)
     learned_models = LearnedModels(
-        _set_of(context), score(found), is_sure, present_score(context)
+        _set_of(context), num_right_poses(found), is_sure, num_right_poses_now(context)
     )
     context.matches.update_state(learned_models=learned_models)
 
@@ -106,8 +106,8 @@ def needs_learned_models(context: Context) -> bool:
     learned_models = learned_models_on_record(context)
     if not learned_models:
         return True
-    is_decided = learned_models.is_chosen or learned_models.score <= present_score(
-        context
+    is_decided = (
+        learned_models.is_chosen or learned_models.score <= num_right_poses_now(context)
     )
     return not is_decided and not context.workspace.learned.exists()
 
@@ -134,7 +134,7 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
     is_wanted = (
         learned_models.is_enough
         if at_once
-        else learned_models.score > present_score(context)
+        else learned_models.score > num_right_poses_now(context)
     )
     choice = _choice_of_learned_matches(escalation) if is_wanted else None
     if not choice or not choice.matches:
@@ -236,8 +236,8 @@ def keep_best(context: Context) -> None:
     is_small = len(context.features.names()) <= SMALL
     if not is_small or workspace.model_inputs() != context.current_model_inputs():
         return
-    present = present_score(context)
-    if present < best_score(context):
+    present = num_right_poses_now(context)
+    if present < num_right_poses_of_best(context):
         return
     with _replaced(workspace.best) as new:
         new.mkdir()
@@ -247,8 +247,8 @@ def keep_best(context: Context) -> None:
         replace_text(new / SCORE, json.dumps([_set_of(context), present]))
 
 
-def best_score(context: Context) -> float:
-    """Return the score of the best models so far; 0 where none of these pairs are kept."""
+def num_right_poses_of_best(context: Context) -> float:
+    """Return the same of the best models so far; 0 where none of these pairs are kept."""
     path = context.workspace.best / SCORE
     if not path.exists():
         return 0.0
@@ -267,7 +267,7 @@ def restore_best(escalation: Escalation) -> bool:
     """
     context = escalation.context
     best = context.workspace.best
-    if best_score(context) <= present_score(context):
+    if num_right_poses_of_best(context) <= num_right_poses_now(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
     pairs = list(escalation.state.num_inliers())

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from colmap_affrect.colmap.verification import PairVerifier
-from colmap_affrect.errors import ImageError, such_as
+from colmap_affrect.errors import such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
 from colmap_affrect.escalation.policy import (
     Plan,
@@ -34,10 +34,11 @@ from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.project.image_failures import UnusableImageError
 from colmap_affrect.project.match_state import Begun, Worth
+from colmap_affrect.project.match_store import Learned, PairMatches
 from colmap_affrect.project.report import MatchedAgain, StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import Learned, PairMatches
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.extract import extract_images
@@ -248,8 +249,9 @@ class Escalation:
 
     def _missing_weights(self) -> list[StageWarning]:
         """Warn of images for which levels that lack weights would be tried."""
-        how = self.context.resources.how_to_complete(self.context.extraction)
-        if not how:
+        resources = self.context.resources
+        commands = resources.commands_to_complete(self.context.extraction)
+        if not commands:
             return []
         left = sorted(self.state.weights(self.state.models()))
         if not left:
@@ -257,7 +259,7 @@ class Escalation:
         values: dict[str, int | str] = {
             "num": len(left),
             "examples": such_as(left),
-            "how": how,
+            "how": ", or ".join(commands),
         }
         return [StageWarning("no_weights", "learned matching", values)]
 
@@ -365,9 +367,10 @@ class Escalation:
     def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
         """Give images the features of a level that they lack, and match pairs with these."""
         missing = self._missing_features(pairs, level)
-        title = f"escalate, {self.context.extraction.levels[level].name}"
+        part = self.context.extraction.levels[level].name
         num_steps = len(missing) + len(pairs)
-        with self.context.progress.stage(title, num_steps, "steps") as advance:
+        stage = self.context.progress.stage
+        with stage("escalate", num_steps, "steps", part) as advance:
             self._extend(missing, advance)
             if pairs:
                 self._match_again(pairs, level, keep, advance)
@@ -399,7 +402,7 @@ class Escalation:
         )
         with closing(images) as found_images:
             for (name, level), found in zip(missing, found_images, strict=True):
-                if isinstance(found, ImageError):
+                if isinstance(found, UnusableImageError):
                     raise found
                 self.context.features.extend(name, found.features, level)
                 advance(1)

@@ -103,7 +103,7 @@ def load_evd(folder: Path) -> Pairs:
             entries.append(_evd_entry(folder, name, *images, file.name))
     if not entries:
         layouts = "1/NAME.png, 2/NAME.png, h/NAME.txt nor NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
-        raise OptionError(f"{folder}: holds neither {layouts}")
+        raise OptionError(f"holds neither {layouts}", where=folder)
     return _load(entries, folder, 0.0)
 
 
@@ -141,7 +141,7 @@ def _load_scenes(pattern: str, load: Callable[[Path], Pairs], path: Path) -> Pai
         pairs += load(file)
     if not pairs:
         why = f"; it has no {pattern}, nor has a folder in it" if not files else ""
-        raise AffrectError(f"{path}: no pair can be evaluated{why}")
+        raise AffrectError(f"no pair can be evaluated{why}", where=path)
     return pairs
 
 
@@ -211,7 +211,9 @@ def _load_svp_scene(list_path: Path) -> Pairs:
     for line in _lines(list_path):
         words = line.split()
         if len(words) not in (2, 3):
-            raise AffrectError(f"{list_path}: '{' '.join(words)}' is no pair of images")
+            raise AffrectError(
+                f"'{' '.join(words)}' is no pair of images", where=list_path
+            )
         listed.append((stem(words[0]), stem(words[1])))
 
     def category(name1: str, name2: str) -> str:  # tens of degrees of rotation
@@ -384,11 +386,11 @@ def load_pairs(folder: Path) -> Pairs:
             entries.append(_entry(values, f"{path}: pairs[{number}]"))
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
     if not entries:
-        raise AffrectError(f"{path}: has no pairs")
+        raise AffrectError("has no pairs", where=path)
     for name, count in Counter(entry.name for entry in entries).items():
         if count > 1:
             raise AffrectError(
-                f"{path}: two pairs are called '{name}'; give them names"
+                f"two pairs are called '{name}'", where=path, advice="give them names"
             )
     return _load(entries, folder, offset_px)
 
@@ -403,10 +405,10 @@ def _entry(values: Any, where: str) -> _Entry:
     except OptionError as error:
         raise AffrectError(str(error)) from error
     if leads_outside(entry.image1) or leads_outside(entry.image2):
-        raise AffrectError(f"{where}: images must be paths of images in the folder")
+        raise AffrectError("images must be paths of images in the folder", where=where)
     if (entry.homography, entry.correspondences, entry.relative_pose).count(None) != 2:
         raise AffrectError(
-            f"{where}: needs homography, correspondences or relative_pose, and one"
+            "needs homography, correspondences or relative_pose, and one", where=where
         )
     return entry.changed(
         name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}"
@@ -452,7 +454,7 @@ def _numbers(given: Any, folder: Path) -> Any:
     if not isinstance(given, str):
         return given
     if leads_outside(given):
-        raise AffrectError(f"{given}: must be a file in the folder of the pairs")
+        raise AffrectError("must be a file in the folder of the pairs", where=given)
     with _damaged(folder / given):
         return np.loadtxt(folder / given, ndmin=2)
 
@@ -467,7 +469,7 @@ def _true_pose(entry: _Entry, offset_px: float) -> TruePose:
         "intrinsics2": (3, 3),
     }
     if not isinstance(given, Mapping) or given.keys() != shapes.keys():
-        raise AffrectError(f"{entry.name}: relative_pose needs {', '.join(shapes)}")
+        raise AffrectError(f"relative_pose needs {', '.join(shapes)}", where=entry.name)
     values = {}
     for key, shape in shapes.items():
         values[key] = finite_numbers(given[key], shape, f"{entry.name}: {key}")

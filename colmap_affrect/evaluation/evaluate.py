@@ -25,7 +25,7 @@ from colmap_affrect.colmap.verification import (
     estimate_geometry,
 )
 from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError, with_flags
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
 from colmap_affrect.evaluation.results import (
@@ -43,10 +43,10 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.report import installed_versions
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Resources
 from colmap_affrect.stages.match import CachedMatcher, Matching
@@ -123,7 +123,7 @@ class RecipeRun:
         """
         if method.recipe is None:
             raise OptionError(
-                f"{method.label} is COLMAP's and no recipe; compare can run it"
+                f"{method.label} is COLMAP's and no recipe", advice="compare can run it"
             )
         self.label = method.label
         self.recipe = method.recipe
@@ -267,8 +267,8 @@ class RecipeRun:
             try:
                 found = self._extractor.extract_file(path, name, intrinsics, missing)
             except AffrectError as error:
-                logger.warning("%s", error)
-                self.failures[name] = str(error)
+                self.failures[name] = with_flags(error.words)
+                logger.warning("%s", self.failures[name])
                 return False
             if found.not_rectified:
                 logger.warning("%s: not rectified: %s", name, found.not_rectified)
@@ -341,7 +341,7 @@ def evaluate(
     output_path = as_path(output_path, "output_path")
     if protocol not in PROTOCOLS:
         raise OptionError(
-            f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}"
+            f"unknown protocol '{protocol}'", advice=f"give {' or '.join(PROTOCOLS)}"
         )
     options = EvaluateOptions.with_keywords(options, keywords)
     require_bools(overwrite=overwrite)
@@ -385,15 +385,19 @@ def _check(options: EvaluateOptions, dataset_path: Path) -> None:
     """Refuse options out of range, and a dataset that is not there; OptionError."""
     if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
         raise OptionError(
-            f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1"
+            "must be at least 1",
+            where=Option("max-num-keypoints", options.max_num_keypoints),
         )
     if options.scores.random_seed < 0:
         raise OptionError(
-            f"--random-seed {options.scores.random_seed}: must be at least 0"
+            "must be at least 0",
+            where=Option("random-seed", options.scores.random_seed),
         )
     if not dataset_path.is_dir():
         raise OptionError(
-            f"{dataset_path}: no such folder; give the folder of the dataset"
+            "no such folder",
+            where=dataset_path,
+            advice="give the folder of the dataset",
         )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
@@ -41,13 +41,17 @@ def resolve_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
-        raise OptionError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
+        raise OptionError(
+            "not one of auto, cpu, cuda, cuda:0, mps", where=Option("device", name)
+        )
     try:
         torch.empty(0, device=name)
     except (AssertionError, RuntimeError) as error:
         why = str(error).splitlines()[0]
         raise OptionError(
-            f"--device {name}: {why}; use --device cpu or auto"
+            why,
+            where=Option("device", name),
+            advice=("use ", Option("device"), " cpu or auto"),
         ) from error
     return torch.device(name)
 

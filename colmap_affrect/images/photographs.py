@@ -15,6 +15,7 @@ import numpy as np
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import (
     ImageError,
+    Option,
     OptionError,
     StoreError,
     not_utf_8,
@@ -24,6 +25,8 @@ from colmap_affrect.errors import (
 from colmap_affrect.images import reading
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
+from colmap_affrect.project.image_failures import ImageFailure, unusable
+from colmap_affrect.project.match_store import pair_key
 from colmap_affrect.project.outputs import is_output_folder
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.regular_files import read_regular_text
@@ -34,7 +37,6 @@ from colmap_affrect.project.stage_warnings import (
     WarningCode,
     texts_by_subject,
 )
-from colmap_affrect.project.stores import pair_key
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 FOLDERS_OF_SYSTEMS: dict[str, WarningCode] = {
@@ -94,10 +96,12 @@ class Photographs:
     def check(self) -> None:
         """Refuse masks that are not there at all: OptionError names the option."""
         if self.masks.path and not Path(self.masks.path).is_dir():
-            raise OptionError(f"--mask-path {self.masks.path}: no such folder")
+            raise OptionError(
+                "no such folder", where=Option("mask-path", self.masks.path)
+            )
         if self.masks.camera_path and not Path(self.masks.camera_path).is_file():
             raise OptionError(
-                f"--camera-mask-path {self.masks.camera_path}: no such file"
+                "no such file", where=Option("camera-mask-path", self.masks.camera_path)
             )
 
     def mask(self, name: str) -> Mask | None:
@@ -147,29 +151,30 @@ class Photographs:
         found = [name for name in paths if not self.own_mask(name)]
         if found and len(found) == len(names):
             raise OptionError(
-                f"--mask-path {self.masks.path}: has no mask of any image, such as "
-                f"{paths[found[0]][0]}"
+                f"has no mask of any image, such as {paths[found[0]][0]}",
+                where=Option("mask-path", self.masks.path),
             )
         return found
 
     def _refuse_photographs(self, names: Sequence[str]) -> None:
         """Refuse masks that are photographs, as in the folder of the photographs; OptionError."""
         given = {
-            "--mask-path": self.masks.path,
-            "--camera-mask-path": self.masks.camera_path,
+            "mask-path": self.masks.path,
+            "camera-mask-path": self.masks.camera_path,
         }
         if not any(given.values()):
             return
         photographs = {resolved(self.folder / name) for name in names}
         for option, where in given.items():
             paths = [Path(where)] if where else []
-            if option == "--mask-path":
+            if option == "mask-path":
                 paths = [path for name in names for path in self._mask_paths(name)]
             for path in paths:
                 if resolved(path) in photographs:
                     raise OptionError(
-                        f"{option} {where}: {path.name} is one of the photographs in "
-                        f"{self.folder}; give the masks a folder of their own, outside of that"
+                        f"{path.name} is one of the photographs in {self.folder}",
+                        where=Option(option, where),
+                        advice="give the masks a folder of their own, outside of that",
                     )
 
     def _mask_paths(self, name: str) -> list[Path]:
@@ -186,10 +191,13 @@ class Photographs:
             paths.append(Path(self.masks.camera_path))
         return [path for path in paths if reading.may_be_photograph(path)]
 
-    def why_impossible(self, name: str) -> str:
-        """Say which of these files is none, or claims more pixels than photographs have."""
-        paths = [self.folder / name, *self.files(name)]
-        return next(filter(None, map(reading.why_unusable, paths)), "")
+    def why_impossible(self, name: str) -> ImageFailure | None:
+        """Return which of these files is none, or claims more pixels than photographs have."""
+        for path in (self.folder / name, *self.files(name)):
+            why = reading.why_unusable(path)
+            if why:
+                return why
+        return None
 
 
 def _mask_of_size(path: Path, size: tuple[int, int] | None, image_path: Path) -> Mask:
@@ -205,9 +213,14 @@ def _mask_of_size(path: Path, size: tuple[int, int] | None, image_path: Path) ->
         found = (mask.shape[1], mask.shape[0])
         if found == size:
             return mask
-    raise ImageError(
-        f"{image_path}: is {size[0]} x {size[1]} px and its mask {found[0]} x {found[1]} px "
-        f"({path}); they must have one size"
+    raise unusable(
+        "mask_of_another_size",
+        image_path,
+        width=size[0],
+        height=size[1],
+        mask_width=found[0],
+        mask_height=found[1],
+        mask=str(path),
     )
 
 
@@ -225,7 +238,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     if not names:
         others = "".join(f"; {warning.line()}" for warning in left_out(image_path))
         raise OptionError(
-            f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}"
+            f"holds no images ({', '.join(IMAGE_SUFFIXES)}){others}", where=image_path
         )
     return names
 
@@ -233,10 +246,14 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
 def require_folder(image_path: Path) -> None:
     """Refuse what is no folder of photographs; OptionError."""
     if image_path.is_file():
-        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
+        raise OptionError(
+            "is a file", where=image_path, advice="give the folder that it is in"
+        )
     if not image_path.is_dir():
         raise OptionError(
-            f"{image_path}: no such folder; give the folder of the photographs"
+            "no such folder",
+            where=image_path,
+            advice="give the folder of the photographs",
         )
 
 
@@ -396,10 +413,10 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
         lines = read_regular_text(image_list_path, "utf-8-sig").splitlines()
     except OSError as error:
         raise OptionError(
-            f"{image_list_path}: cannot be read ({error.strerror})"
+            f"cannot be read ({error.strerror})", where=image_list_path
         ) from error
     except UnicodeDecodeError as error:
-        raise OptionError(not_utf_8(image_list_path)) from error
+        raise not_utf_8(image_list_path) from error
     listed = []
     for line in dict.fromkeys(lines):
         if _is_below(image_path, line):  # a name may begin with a space or #
@@ -407,7 +424,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
         elif line.strip() and not line.startswith("#"):
             listed.append(line.strip())
     if not listed:
-        raise OptionError(f"{image_list_path}: is empty")
+        raise OptionError("is empty", where=image_list_path)
     return checked_names(image_path, names=listed, where=str(image_list_path))
 
 
@@ -431,10 +448,10 @@ def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> li
     for name in found:
         odd = _odd(name)
         if odd:
-            raise ImageError(f"{image_path}: {name!r}: {ODD_NAMES[odd]}")
+            raise ImageError(f"{name!r}: {ODD_NAMES[odd]}", where=image_path)
     if missing:
         raise OptionError(
-            f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}"
+            f"lists {such_as(missing, 1)}, which is not in {image_path}", where=where
         )
     return found
 
@@ -454,6 +471,7 @@ def refuse_colliding_keys(names: Sequence[str]) -> None:
         other = seen.setdefault(pair_key(name, ""), name)
         if other != name:
             raise StoreError(
-                f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
-                "'-'; rename one of them"
+                f"{other} and {name} have the same key in hloc's match files, where '/' "
+                "becomes '-'",
+                advice="rename one of them",
             )

@@ -31,6 +31,12 @@ from colmap_affrect.images.pnm import (
     with_usual_white,
 )
 from colmap_affrect.images.tiff import stand_upright
+from colmap_affrect.project.image_failures import (
+    NO_IMAGE,
+    ImageFailure,
+    UnusableImageError,
+    unusable,
+)
 from colmap_affrect.project.regular_files import (
     NotAFileError,
     open_regular,
@@ -82,7 +88,7 @@ def open_image(file: BinaryIO) -> Image.Image:
     for magic, reader in READERS.items():
         if start.startswith(magic):
             return reader(file, "")
-    raise ValueError(UNREADABLE)
+    raise ValueError(NO_IMAGE)
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -122,8 +128,8 @@ def _claimed_size(file: BinaryIO) -> tuple[int, int]:
     return stored_size(open_image(file))
 
 
-def why_unusable(path: Path) -> str:
-    """Say why a file should not even be opened as a photograph; empty if it may be one.
+def why_unusable(path: Path) -> ImageFailure | None:
+    """Return why a file should not even be opened as a photograph; None if it may be one.
 
     What is no regular file, claims more pixels than photographs have or is longer than any: for
     readers that open files by their names and take what these claim.
@@ -131,9 +137,9 @@ def why_unusable(path: Path) -> str:
     try:
         _require_photograph(path)
         require_possible(path)
-    except ImageError as error:
-        return str(error)
-    return ""
+    except UnusableImageError as error:
+        return error.failure
+    return None
 
 
 def _require_photograph(path: Path) -> int:
@@ -144,10 +150,9 @@ def _require_photograph(path: Path) -> int:
     except OSError as error:
         raise cannot_read(path, error) from error
     if num_bytes > MAX_NUM_BYTES:
-        raise ImageError(
-            f"{path}: is {num_bytes / 1e9:.0f} GB long, and {MAX_NUM_BYTES / 1e9:.0f} are the most "
-            "that are read; shrink it"
-        )
+        most = MAX_NUM_BYTES / 1e9
+        gigabytes = num_bytes / 1e9
+        raise unusable("too_long", path, gigabytes=gigabytes, most_gigabytes=most)
     return num_bytes
 
 
@@ -167,11 +172,12 @@ def _require_plausible(path: Path, num_bytes: int) -> None:
         return
     num_px = read_header(path, _num_px_of_pages)
     if num_px is None:
-        raise ImageError(f"{path}: {UNREADABLE}")
+        raise unusable("no_image", path)
     if num_bytes > USUAL_BYTES + MAX_BYTES_PER_PX * num_px:
-        raise ImageError(
-            f"{path}: is {num_bytes / 1e9:.1f} GB long, which its {num_px / 1e6:.1f} megapixels do "
-            "not need; it is damaged, or something else hangs on it: save it again"
+        megapixels = num_px / 1e6
+        gigabytes = num_bytes / 1e9
+        raise unusable(
+            "longer_than_its_pixels", path, gigabytes=gigabytes, megapixels=megapixels
         )
 
 
@@ -207,11 +213,11 @@ def read_photograph(path: Path) -> Bytes:
         raise cannot_read(path, error) from error
 
 
-def cannot_read(path: Path, error: OSError) -> ImageError:
+def cannot_read(path: Path, error: OSError) -> UnusableImageError:
     """Return the error that says why a file cannot be read."""
     if isinstance(error, NotAFileError):
-        return ImageError(f"{path}: {error}")
-    return ImageError(f"{path}: cannot be read ({error.strerror or error})")
+        return unusable("no_file", path, reason=str(error))
+    return unusable("unreadable", path, reason=error.strerror or str(error))
 
 
 def is_too_large(size: tuple[int, int] | None) -> bool:
@@ -223,13 +229,18 @@ def require_possible(path: Path) -> None:
     """Refuse an image of more pixels than photographs have; ImageError."""
     size = header_size(path)
     if size and is_too_large(size):
-        raise ImageError(
-            f"{path}: claims to be {size[0]} x {size[1]} px, and {MAX_NUM_PX >> 20} megapixels are "
-            "the most that are read; shrink it"
-        )
+        raise too_many_pixels(path, size)
 
 
-UNREADABLE = "not a readable image (damaged, empty, or of an unknown format)"
+def too_many_pixels(path: Path, size: tuple[int, int]) -> UnusableImageError:
+    """Return the error of a file whose header claims too many pixels, (width, height)."""
+    width, height = size
+    most = MAX_NUM_PX >> 20
+    return unusable(
+        "too_many_pixels", path, width=width, height=height, most_megapixels=most
+    )
+
+
 LIMITS_OF_OPENCV = (
     "OPENCV_IO_MAX_IMAGE_PIXELS",
     "OPENCV_IO_MAX_IMAGE_WIDTH",
@@ -421,10 +432,7 @@ def decode_bytes(
     """
     name = foreign_format(data)
     if name:
-        raise ImageError(
-            f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
-            "JPEG (colmap-affrect convert)"
-        )
+        raise unusable("foreign_format", path, format=name)
     stand_upright(data)
     header = pnm_header(data)
     if header and header.is_text:
@@ -432,22 +440,22 @@ def decode_bytes(
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
-        raise ImageError(f"{path}: {_why_not_decoded(error)}") from error
+        raise _not_decoded(path, error) from error
     if image is None:
-        raise ImageError(f"{path}: {UNREADABLE}")
+        raise unusable("no_image", path)
     image = np.asarray(image)
     if header and not (header.is_scaled or keeps_numbers):
         image = with_usual_white(image, header.white)
     return image
 
 
-def _why_not_decoded(error: cv2.error) -> str:
-    """Say why OpenCV refuses an image: the system's settings may let it read fewer pixels."""
+def _not_decoded(path: Path, error: cv2.error) -> UnusableImageError:
+    """Return why OpenCV refuses an image: the system's settings may let it read fewer pixels."""
     limits = [name for name in LIMITS_OF_OPENCV if name in os.environ]
     if error.func == OPENCV_CHECKS_SIZE and limits:
         settings = ", ".join(f"{name}={os.environ[name]}" for name in limits)
-        return f"is larger than OpenCV may read here, by {settings} of the environment; unset it"
-    return UNREADABLE
+        return unusable("limit_of_opencv", path, settings=settings)
+    return unusable("no_image", path)
 
 
 def foreign_format(data: Bytes) -> str:

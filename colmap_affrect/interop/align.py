@@ -21,7 +21,7 @@ from colmap_affrect.colmap.model_files import (
     why_unusable,
     write_model,
 )
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, Option, OptionError, Row
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
 from colmap_affrect.interop.consensus import agreeing
@@ -145,7 +145,9 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
     """Align with checked arguments."""
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError(
-            "--distance: gives the scale alone; leave it out, or the positions"
+            "gives the scale alone",
+            where=Option("distance"),
+            advice="leave it out, or the positions",
         )
     model = read_finished_model(model_path)
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
@@ -229,7 +231,13 @@ def _positions(reference: Reference) -> tuple[Places, bool]:
         return _gps(reference.gps_database)
     if reference.positions_path:
         return _table_of_positions(reference.positions_path)
-    raise OptionError("give --gps, --positions, --points or --distance")
+    raise OptionError(
+        "where the model is, nothing says",
+        advice=(
+            ("give ", Option("gps"), ", ", Option("positions"), ", ", Option("points")),
+            (" or ", Option("distance")),
+        ),
+    )
 
 
 def _without(places: Places, names: Collection[str]) -> Places:
@@ -280,8 +288,9 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(
-            f"the true places of {len(names)} photographs or points of the model are known, and "
-            f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
+            f"the true places of {len(names)} photographs or points of the model "
+            "are known, and 3 are needed; known are those of "
+            f"{', '.join(sorted(true)[:3]) or 'none'}",
         )
     before = np.array([old[name] for name in names])
     after = np.array([true[name] for name in names])
@@ -292,8 +301,13 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
         along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if across <= MIN_WIDTH * along:
             raise OptionError(
-                "the known places lie on one line, about which the model could be turned; give "
-                "others beside it, or --distance for the scale alone"
+                "the known places lie on one line, about which the model could be "
+                "turned",
+                advice=(
+                    "give others beside it, or ",
+                    Option("distance"),
+                    " for the scale alone",
+                ),
             )
     new_from_old = pycolmap.estimate_sim3d(before, after)
     if new_from_old is None:
@@ -315,12 +329,17 @@ def _scale(places: Places, distances: Sequence[tuple[str, str, float]]) -> _Fit:
         for name in (first, second):
             if name not in places:
                 raise OptionError(
-                    f"--distance: {name} is no photograph of the model, nor a point of --points"
+                    (
+                        f"{name} is no photograph of the model, nor a point of ",
+                        Option("points"),
+                    ),
+                    where=Option("distance"),
                 )
         own = float(np.linalg.norm(places[first] - places[second]))
         if own <= 0.0 or not 0.0 < length < np.inf:
             raise OptionError(
-                f"--distance {first},{second}: must be of two places, and positive"
+                "must be of two places, and positive",
+                where=(Option("distance"), f" {first},{second}"),
             )
         lengths[f"{first},{second}"] = own, length
     log_ratios = [np.log(true / own) for own, true in lengths.values()]
@@ -339,10 +358,12 @@ def _gps(path: Path) -> tuple[Places, bool]:
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
         raise DatabaseError(
-            f"{path}: no photograph has a position; give --positions FILE"
+            "no photograph has a position",
+            where=path,
+            advice=("give ", Option("positions"), " FILE"),
         )
     if len(systems) > 1:
-        raise DatabaseError(f"{path}: some positions are on earth, others are not")
+        raise DatabaseError("some positions are on earth, others are not", where=path)
     true = Places()
     for prior in priors:
         image_id = prior.corr_data_id.id
@@ -351,27 +372,29 @@ def _gps(path: Path) -> tuple[Places, bool]:
     return true, pycolmap.PosePriorCoordinateSystem.WGS84 in systems
 
 
-def _numbers(row: Mapping[str, str], columns: Sequence[str], where: str) -> Array:
+def _numbers(row: Mapping[str, str], columns: Sequence[str], where: Row) -> Array:
     """Return the numbers of some columns of a row of a table."""
     values = []
     for column in columns:
         try:
             values.append(float(row[column]))
         except (KeyError, ValueError) as error:
-            raise OptionError(f"{where}: {column} is missing, or no number") from error
+            raise OptionError(
+                f"{column} is missing, or no number", where=where
+            ) from error
         if not np.isfinite(values[-1]):
-            raise OptionError(f"{where}: {column} is not finite")
+            raise OptionError(f"{column} is not finite", where=where)
     return np.array(values)
 
 
 def _table_of_positions(path: Path) -> tuple[Places, bool]:
     """Return the positions of a table, and whether they are on earth."""
-    rows = read_table(path, f"--positions {path}", ("name", *METRIC, *ON_EARTH))
+    rows = read_table(path, "positions", ("name", *METRIC, *ON_EARTH))
     is_on_earth = any("latitude" in row for _, row in rows)
     true = Places()
     for place, row in rows:
         if "name" not in row or row["name"] in true:
-            raise OptionError(f"{place}: has no name, or one that was there before")
+            raise OptionError("has no name, or one that was there before", where=place)
         true[row["name"]] = _numbers(row, ON_EARTH if is_on_earth else METRIC, place)
     return true, is_on_earth
 
@@ -380,14 +403,13 @@ def _marked_points(
     model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], path: Path
 ) -> tuple[Places, Places]:
     """Return where marked points are in the model, and the true places of control points."""
-    where = f"--points {path}"
     marks: defaultdict[str, dict[int, Array]] = defaultdict(dict)  # by image id
     true = Places()
     columns = ("point", "image", "px", "py", *METRIC)
-    for place, row in read_table(path, where, columns, "point"):
+    for place, row in read_table(path, "points", columns, "point"):
         name = row.get("point", "")
         if not name:
-            raise OptionError(f"{place}: names no point")
+            raise OptionError("names no point", where=place)
         if not row.keys().isdisjoint(METRIC):
             true[name] = _numbers(row, METRIC, place)
         image = images.get(row.get("image", ""))
@@ -396,13 +418,13 @@ def _marked_points(
             mark = _numbers(row, ("px", "py"), place)
             require_inside(place, mark, image.name, (camera.width, camera.height))
             marks[name][image.image_id] = mark
-    return _triangulated_points(model, marks, where), true
+    return _triangulated_points(model, marks, Option("points", path)), true
 
 
 def _triangulated_points(
     model: pycolmap.Reconstruction,
     marks: Mapping[str, Mapping[int, Array]],
-    where: str,
+    where: Option,
 ) -> Places:
     """Return where points are in a model that are marked in two of its images or more."""
     old = Places()
@@ -412,9 +434,13 @@ def _triangulated_points(
         point = triangulated(model, marked)
         if point is None:
             raise OptionError(
-                f"{where}: the rays of point {name} do not meet; look at its marks"
+                f"the rays of point {name} do not meet",
+                where=where,
+                advice="look at its marks",
             )
         old[name] = point
     if not old:
-        raise OptionError(f"{where}: no point is marked in two registered photographs")
+        raise OptionError(
+            "no point is marked in two registered photographs", where=where
+        )
     return old

@@ -6,7 +6,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import known_model
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.geometry.arrays import Array
 
 GRID = 41  # pixels on a side of an image that are compared; resource
@@ -34,7 +34,7 @@ def with_camera_model(model: pycolmap.Reconstruction, name: str) -> dict[int, fl
     try:
         known_model(name)
     except ValueError as error:
-        raise OptionError(f"--camera-model {error}") from error
+        raise OptionError(Option("camera-model", error)) from error
     differences = {}
     for camera_id, camera in sorted(model.cameras.items()):
         if camera.model_name == name:
@@ -89,7 +89,7 @@ def _grid(camera: pycolmap.Camera) -> tuple[Array, Array]:
     has_ray = np.isfinite(flat).all(axis=1)
     if not has_ray.any():
         raise AffrectError(
-            f"camera {camera.camera_id}: no point of its images has a ray"
+            "no point of its images has a ray", where=f"camera {camera.camera_id}"
         )
     flat = flat[has_ray]
     return pixels[has_ray], np.column_stack([flat, np.ones(len(flat))])

@@ -19,7 +19,7 @@ from colmap_affrect.colmap.model_files import (
     write_model,
 )
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
-from colmap_affrect.errors import ImageError, OptionError, StoreError, such_as
+from colmap_affrect.errors import ImageError, Option, OptionError, StoreError, such_as
 from colmap_affrect.images.orientation import forget_orientation
 from colmap_affrect.images.reading import header_size
 from colmap_affrect.interop.camera_models import with_camera_model
@@ -109,7 +109,7 @@ def export(
 def _source(model_path: Path, image_path: Path | None) -> Source:
     """Read what is exported; the photographs are by default those of the run."""
     if image_path is not None and not image_path.is_dir():
-        raise OptionError(f"--image-path {image_path}: no such folder")
+        raise OptionError("no such folder", where=Option("image-path", image_path))
     photographs = (
         image_path or Workspace(resolved(model_path).parent.parent).photographs()
     )
@@ -140,7 +140,7 @@ def _checked_formats(given: str | Sequence[str]) -> list[str]:
     for name in formats:
         if name not in FORMATS:
             raise OptionError(
-                f"--format {name}: unknown{suggestion(str(name), FORMATS)}"
+                f"unknown{suggestion(str(name), FORMATS)}", where=Option("format", name)
             )
     return formats
 
@@ -153,9 +153,11 @@ def _change_cameras(
 ) -> None:
     if not {"text", "cameras"}.intersection(formats):
         raise OptionError(
-            "--camera-model: changes 'text' and 'cameras'; give one of these formats"
+            "changes 'text' and 'cameras'",
+            where=Option("camera-model"),
+            advice="give one of these formats",
         )
-    refuse_panoramas(model, "--camera-model")
+    refuse_panoramas(model, Option("camera-model"))
     before = {
         camera_id: camera.model_name for camera_id, camera in model.cameras.items()
     }
@@ -181,8 +183,10 @@ def _text(source: Source, folder: Path) -> Path:
     why = _why_no_text(source)
     if why:
         raise OptionError(
-            f"text: {why}; rename the photographs and run again, or leave that format out and use "
-            "the binary model as it is"
+            why,
+            where="text",
+            advice="rename the photographs and run again, or leave that format out and "
+            "use the binary model as it is",
         )
     with native_writes(path):
         path.mkdir()
@@ -226,7 +230,8 @@ def _undistorted(source: Source, folder: Path) -> Path:
     refuse_panoramas(source.model, "undistorted photographs")
     if source.image_path is None:
         raise OptionError(
-            "--image-path: give the folder of the photographs, to undistort them"
+            "give the folder of the photographs, to undistort them",
+            where=Option("image-path"),
         )
     _check_photographs(source, source.image_path)
     given = folder.parent / "model"  # a run may remove that of its folder meanwhile
@@ -236,7 +241,9 @@ def _undistorted(source: Source, folder: Path) -> Path:
     for image in source.images():
         picture = path / "images" / image.name
         if not picture.is_file():
-            raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
+            raise ImageError(
+                "COLMAP cannot undistort it, or write it", where=picture.name
+            )
         # COLMAP takes over EXIF, by which others would turn it
         forget_orientation(picture)
     return path
@@ -247,12 +254,15 @@ def _check_photographs(source: Source, image_path: Path) -> None:
     for image in source.images():
         if leads_outside(image.name):
             raise OptionError(
-                f"{source.path}: the image name {image.name} leads out of the folder of the "
-                "photographs; rename it, no undistorted picture can be written for it"
+                f"the image name {image.name} leads out of the folder of the photographs",
+                where=source.path,
+                advice="rename it, no undistorted picture can be written for it",
             )
         if not (image_path / image.name).is_file():
             raise ImageError(
-                f"{image_path / image.name}: no such photograph; give --image-path"
+                "no such photograph",
+                where=image_path / image.name,
+                advice=("give ", Option("image-path")),
             )
         _require_size(image_path / image.name, source.model.cameras[image.camera_id])
 
@@ -263,8 +273,13 @@ def _require_size(path: Path, camera: pycolmap.Camera) -> None:
     expected = (camera.width, camera.height)
     if size not in (None, expected):
         raise ImageError(
-            f"{path}: is {size[0]} x {size[1]} px, and its camera {expected[0]} x {expected[1]}; "
-            "give the photographs that the model was made of as --image-path"
+            f"is {size[0]} x {size[1]} px, and its camera {expected[0]} x "
+            f"{expected[1]}",
+            where=path,
+            advice=(
+                "give the photographs that the model was made of as ",
+                Option("image-path"),
+            ),
         )
 
 

@@ -23,8 +23,9 @@ def read_finished_model(folder: Path) -> pycolmap.Reconstruction:
         for path in (whole, *whole.parents[:2]):
             if Workspace(path).is_in_use():
                 raise WorkspaceError(
-                    f"{folder}: another colmap-affrect is writing this model; wait for it, and run "
-                    "the same command again"
+                    "another colmap-affrect is writing this model",
+                    where=folder,
+                    advice="wait for it, and run the same command again",
                 ) from None
     return read_given_model(folder)  # the run may have ended just now
 

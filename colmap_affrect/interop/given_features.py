@@ -47,8 +47,8 @@ def keys_of(
             unknown.append(key)
     if unknown:
         raise StoreError(
-            f"{features.path}: has features of images that are not in {image_path}: "
-            f"{such_as(unknown)}"
+            f"has features of images that are not in {image_path}: {such_as(unknown)}",
+            where=features.path,
         )
     return found
 
@@ -70,7 +70,8 @@ def given_descriptors(features: GivenFile, key: str, count: int) -> NDArray[Any]
     shape = features.shapes[f"{key}/descriptors"]
     if len(shape) != 2 or count not in shape:
         raise StoreError(
-            f"{features.path}: {key}/descriptors has shape {shape}, expected (D, {count})"
+            f"{key}/descriptors has shape {shape}, expected (D, {count})",
+            where=features.path,
         )
     values = features.read(f"{key}/descriptors", shape)
     return values.T if shape[1] == count else values
@@ -98,8 +99,10 @@ def require_size(
     if size != expected:
         turned = " (turned by its EXIF orientation?)" if size == expected[::-1] else ""
         raise StoreError(
-            f"{source.path}: {name} was {size[0]:g} x {size[1]:g} px for the features{turned}, "
-            f"and the photograph is {expected[0]} x {expected[1]} px; use the same photographs"
+            f"{name} was {size[0]:g} x {size[1]:g} px for the features{turned}, and "
+            f"the photograph is {expected[0]} x {expected[1]} px",
+            where=source.path,
+            advice="use the same photographs",
         )
 
 

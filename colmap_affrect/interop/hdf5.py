@@ -44,6 +44,7 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.errors import (
     ImageError,
+    Option,
     OptionError,
     StoreError,
     such_as,
@@ -74,15 +75,11 @@ from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.progress import Advance, GivenProgress, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.feature_store import frame_datasets
 from colmap_affrect.project.given_h5 import GivenFile, open_given_file
+from colmap_affrect.project.match_store import PairMatches, hloc_matches, pair_key
 from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none, resolved
-from colmap_affrect.project.stores import (
-    PairMatches,
-    frame_datasets,
-    hloc_matches,
-    pair_key,
-)
 from colmap_affrect.stages.descriptors import (
     Arrays,
     iterate_descriptor_matches,
@@ -190,7 +187,8 @@ def import_h5(  # noqa: PLR0913 (all but three are keywords)
     progress = Progress.given(progress)
     if matches_path and match_list_path:
         raise OptionError(
-            "--match-list-path: only without --matches-path: it says what to match"
+            ("only without ", Option("matches-path"), ": it says what to match"),
+            where=Option("match-list-path"),
         )
     wanted = _Wanted(
         matches_path=as_path_or_none(matches_path, "matches_path"),
@@ -237,8 +235,9 @@ def _import(
             lost = sorted(keys.keys() & set(rejected))
             if lost:
                 raise ImageError(
-                    f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
-                    f"mode {cameras.mode} allows): {such_as(lost)}"
+                    "COLMAP does not take (damaged, or of another size than camera mode "
+                    f"{cameras.mode} allows): {such_as(lost)}",
+                    where=image_path,
                 )
             unkept = _fill(new, features, keys, progress)
             _fill_matches(path=new, given=found, wanted=wanted, progress=progress)
@@ -272,8 +271,12 @@ def _matches(
     ]
     if lacking:
         raise StoreError(
-            f"{features.path}: has no descriptors to match by (give --matches-path): "
-            f"{such_as(lacking)}"
+            (
+                "has no descriptors to match by (give ",
+                Option("matches-path"),
+                f"): {such_as(lacking)}",
+            ),
+            where=features.path,
         )
     names = sorted(keys)
     if wanted.match_list_path:
@@ -292,7 +295,7 @@ def _matches(
             for pair, matches in iterate_descriptor_matches(pairs, read):
                 yield pair, matches.indices
         except OptionError as error:
-            raise StoreError(f"{features.path}: {error}") from error
+            raise StoreError(error, where=features.path) from error
 
     yield GivenMatches(path=features.path, pairs=tuple(pairs), read=matched_pairs)
 
@@ -370,7 +373,9 @@ def _write_keypoints(
     keypoints = keypoint_rows(source, key)
     for kind in USELESS_KEYPOINTS.intersection(keypoint_problems(keypoints, expected)):
         check = CHECKS[kind]
-        raise StoreError(f"{source.path}: {check['what']}: {name}; {check['advice']}")
+        raise StoreError(
+            f"{check['what']}: {name}", where=source.path, advice=check["advice"]
+        )
     database.write_keypoints(image.image_id, keypoints)
 
 
@@ -405,7 +410,7 @@ def export_h5(
     matches_path = as_path(matches_path, "matches_path")
     progress = Progress.given(progress)
     if resolved(features_path) == resolved(matches_path):
-        raise OptionError(f"{features_path}: features and matches need a file each")
+        raise OptionError("features and matches need a file each", where=features_path)
     with open_copy(database_path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.name)
         known = [image for image in images if database.exists_keypoints(image.image_id)]
@@ -490,7 +495,9 @@ def _check_names(names: Sequence[str]) -> None:
     folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
     both = sorted(folders.intersection(names))
     if both:
-        raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
+        raise StoreError(
+            "is an image and the folder of another", where=both[0], advice="rename it"
+        )
 
 
 def _is_plain(name: str) -> bool:

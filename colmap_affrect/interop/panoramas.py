@@ -137,26 +137,34 @@ def _check(image_path: Path, names: Sequence[str]) -> None:
     """Refuse pictures that are no panoramas of one size, before anything is made."""
     if len(names) < 2:
         raise ImageError(
-            f"{image_path}: has {len(names)} pictures; give two panoramas or more"
+            f"has {len(names)} pictures",
+            where=image_path,
+            advice="give two panoramas or more",
         )
     first_size = None
     for name in names:
         tags = read_camera_tags(image_path / name)
         if not (tags and tags.size):
             raise ImageError(
-                f"{image_path / name}: cannot be read; take it out of the folder"
+                "cannot be read",
+                where=image_path / name,
+                advice="take it out of the folder",
             )
         width, height = tags.size
         if width != 2 * height:
             raise ImageError(
-                f"{image_path / name}: is {width} x {height} px, and a panorama of 360 x 180 "
-                "degrees is twice as wide as high; take it out of the folder"
+                f"is {width} x {height} px, and a panorama of 360 x 180 degrees is "
+                "twice as wide as high",
+                where=image_path / name,
+                advice="take it out of the folder",
             )
         first_size = first_size or tags.size
         if tags.size != first_size:
             raise ImageError(
-                f"{image_path / name}: is {width} x {height} px, and {names[0]} is "
-                f"{first_size[0]} x {first_size[1]} px; panoramas must have one size"
+                f"is {width} x {height} px, and {names[0]} is {first_size[0]} x "
+                f"{first_size[1]} px",
+                where=image_path / name,
+                advice="panoramas must have one size",
             )
 
 
@@ -164,7 +172,9 @@ def _check_output(image_path: Path, output_path: Path) -> None:
     """Refuse to write among panoramas, or into a folder of something else."""
     if resolved(output_path).is_relative_to(resolved(image_path)):
         raise OptionError(
-            f"{output_path}: is in the folder of the panoramas; give another one"
+            "is in the folder of the panoramas",
+            where=output_path,
+            advice="give another one",
         )
     for name in (
         "",
@@ -180,4 +190,6 @@ def _check_output(image_path: Path, output_path: Path) -> None:
     if is_other or (
         output_path.is_dir() and any(output_path.iterdir()) and not begun.is_dir()
     ):
-        raise OptionError(f"{output_path}: exists already; give a new folder")
+        raise OptionError(
+            "exists already", where=output_path, advice="give a new folder"
+        )

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -52,8 +52,12 @@ def write_report(model_path: Path, folder: Path) -> Path:
     workspace = Workspace(model_path.resolve().parent.parent)
     if not workspace.page.is_file():
         raise OptionError(
-            f"report: {workspace.page}: no such page; give the output folder of a run, or "
-            "map without --no-page"
+            f"{workspace.page}: no such page",
+            where="report",
+            advice=(
+                "give the output folder of a run, or map without ",
+                Option("no-page"),
+            ),
         )
     folder.mkdir()
     page = folder / "report.html"

@@ -257,7 +257,8 @@ def match_image_pairs(
     path = translate.given_path(options.match_list_path)
     if not path:
         raise AffrectError(
-            "pairing_options: give match_list_path, a file with two names per line"
+            "give match_list_path, a file with two names per line",
+            where="pairing_options",
         )
     return read_pairs(Path(path), images.names)
 
@@ -281,11 +282,12 @@ def _match_descriptors(
     nearest = matching if isinstance(matching, NearestOptions) else None
     if matching and not nearest:
         raise OptionError(
-            "matching_options: descriptors of a database take NearestOptions alone"
+            "descriptors of a database take NearestOptions alone",
+            where="matching_options",
         )
     refused = sorted(asked.keys() & {"guided_matching", "rig_verification"})
     if refused:
-        raise OptionError(f"{refused[0]}: not for descriptors of another program")
+        raise OptionError("not for descriptors of another program", where=refused[0])
     path = context.workspace.database
     begun = time.perf_counter()
     refuse_unusable(path)
@@ -488,19 +490,22 @@ class _Cancellable(Progress):
         self._token = token
 
     @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+    def stage(
+        self, name: str, total: int, unit: str, part: str = ""
+    ) -> Iterator[Advance]:
         """Show a stage, and look at the token whenever something is done.
 
         Args:
             name: of the stage.
             total: number of steps.
             unit: what the steps are.
+            part: what is done in this stage now.
 
         Raises:
             InterruptedError: the token is cancelled.
         """
         self._check()
-        with self._shown.stage(name, total, unit) as advance:
+        with self._shown.stage(name, total, unit, part) as advance:
 
             def advance_or_end(count: int) -> None:
                 advance(count)

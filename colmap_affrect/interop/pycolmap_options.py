@@ -77,18 +77,18 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
         resolve(
             options=options,
             given=_unusual(_named(given), options),
-            flag=f"{argument}:",
+            option=f"{argument}:",
             owned={},
         )
     else:
         shown = f"{argument}: {type(given).__name__} does not apply here"
         raise OptionError(
-            f"{shown}; give pycolmap.{kind.__name__} or a dictionary of its fields"
+            shown, advice=f"give pycolmap.{kind.__name__} or a dictionary of its fields"
         )
     for key, value in _differing(options).items():
         if kind in HONOURED and key not in HONOURED[kind]:
             shown = getattr(value, "name", value)
-            raise OptionError(f"{argument}: {key}={shown} cannot be carried over")
+            raise OptionError(f"{key}={shown} cannot be carried over", where=argument)
     return options
 
 
@@ -204,7 +204,7 @@ def mapper_options(asked: object) -> MapperOptions:
     given = native(asked, pycolmap.IncrementalPipelineOptions, "options")
     for key, value in _differing(given).items():
         if isinstance(value, list | set):
-            raise OptionError(f"options: {key}={value} cannot be carried over")
+            raise OptionError(f"{key}={value} cannot be carried over", where="options")
     kept = {}
     values = differences(given, pycolmap.IncrementalPipelineOptions(), _named(asked))
     for key, value in values.items():

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.model_files import (
     read_given_model,
     refuse_panoramas,
 )
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options
 from colmap_affrect.project.paths import GivenPath, resolved
@@ -43,8 +43,9 @@ class Extension(Options):
         """Raise OptionError for a model in a folder whose results are to be discarded first."""
         if resolved(self.model_path).is_relative_to(resolved(output_path)):
             raise OptionError(
-                f"--extend {self.model_path}: --overwrite would discard it; leave that out, or use "
-                "another --output-path"
+                (Option("overwrite"), " would discard it"),
+                where=Option("extend", self.model_path),
+                advice=("leave that out, or use another ", Option("output-path")),
             )
 
     def digest(self) -> str:
@@ -129,8 +130,8 @@ def read_to_extend(model_path: Path) -> pycolmap.Reconstruction:
     OptionError when there is no such folder, no model in it, or one of panoramas; StoreError when
     it is damaged.
     """
-    model = read_given_model(model_path, "--extend ")
-    refuse_panoramas(model, f"--extend {model_path}")
+    model = read_given_model(model_path, "extend")
+    refuse_panoramas(model, Option("extend", model_path))
     return model
 
 
@@ -185,8 +186,10 @@ def _known_names(
     missing = [name for name in names if name not in known]
     if missing:
         raise AffrectError(
-            f"--extend {path}: {len(missing)} of its {len(names)} images, such as {missing[0]}, "
-            "are not among the photographs; give the folder with old and new ones"
+            f"{len(missing)} of its {len(names)} images, such as {missing[0]}, are "
+            "not among the photographs",
+            where=Option("extend", path),
+            advice="give the folder with old and new ones",
         )
     return names
 
@@ -215,14 +218,17 @@ def _take_cameras(
         target = new.camera(image.new.camera_id)
         if (camera.width, camera.height) != (target.width, target.height):
             raise AffrectError(
-                f"--extend {path}: {name} is {camera.width} x {camera.height} px there and "
-                f"{target.width} x {target.height} px here"
+                f"{name} is {camera.width} x {camera.height} px there and "
+                f"{target.width} x {target.height} px here",
+                where=Option("extend", path),
             )
         first = taken.setdefault(image.new.camera_id, image)
         if not _is_same_camera(camera, old.camera(first.old.camera_id)):
             raise AffrectError(
-                f"--extend {path}: {first.old.name} and {name} have different cameras there and "
-                "share one here; use the camera mode that the model was made with, or per-image"
+                f"{first.old.name} and {name} have different cameras there and share "
+                "one here",
+                where=Option("extend", path),
+                advice="use the camera mode that the model was made with, or per-image",
             )
         target.model = camera.model
         target.params = list(camera.params)
@@ -276,7 +282,8 @@ def _take_poses(
         difference = np.abs(pose - image.new.cam_from_world().matrix()).max()
         if difference > SAME_POSE * (1 + np.abs(pose[:, 3]).max()):
             raise AffrectError(
-                f"--extend {path}: the pose of {image.old.name} does not fit the rig it has here"
+                f"the pose of {image.old.name} does not fit the rig it has here",
+                where=Option("extend", path),
             )
 
 

@@ -8,12 +8,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import ONE_MAPPING, run_mapping
 from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.native_options import Plain, resolve, set_values
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.camera_priors import camera_priors
 
-FLAG = "--mapper-options"
+FLAG = Option("mapper-options")
 TRACK_LENGTHS = (
     "mapper.track_min_num_views_per_track",
     "mapper.global_positioning.min_num_view_per_track",
@@ -83,7 +83,11 @@ class GlobalMapper:
             KeyboardInterrupt: After mapping has been stopped, once COLMAP has ended.
         """
         if task.extend:
-            raise OptionError("--extend: the global mapper cannot; use --mapper sparse")
+            raise OptionError(
+                "the global mapper cannot",
+                where=Option("extend"),
+                advice=("use ", Option("mapper"), " sparse"),
+            )
         with ONE_MAPPING:
             return self._models(task, output_path, random_seed, show)
 

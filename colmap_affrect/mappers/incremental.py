@@ -11,7 +11,7 @@ from colmap_affrect.colmap.cancellable import ONE_MAPPING, run_mapping
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import model_poses, registered_names
 from colmap_affrect.colmap.native_options import resolve, set_values
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
 from colmap_affrect.mappers.snapshots import (
@@ -21,7 +21,7 @@ from colmap_affrect.mappers.snapshots import (
 )
 from colmap_affrect.options import within
 
-FLAG = "--mapper-options"
+FLAG = Option("mapper-options")
 
 
 class PipelineOptions(MapperOptions):
@@ -66,7 +66,9 @@ class IncrementalMapper:
         resolved = resolve(native, options.mapper_options, FLAG)
         if not native.check():
             given = " ".join(f"{key}={value}" for key, value in resolved.items())
-            raise OptionError(f"{FLAG} {given}: COLMAP does not accept these values")
+            raise OptionError(
+                "COLMAP does not accept these values", where=(FLAG, f" {given}")
+            )
         self.options = options.changed(mapper_options=resolved)
 
     def map(

@@ -52,7 +52,9 @@ class _Attempt:
 class Search:
     """Looks for the models with the highest scores."""
 
+    # Its priors may be those of one trial, which holds unknown focal lengths near a value
     adjuster: Adjuster
+    # Its priors are what is known of the cameras, the same in all trials, so that scores compare
     scorer: ModelScorer
     native: pycolmap.IncrementalPipelineOptions
     max_models_without_gain: int  # in a row, after which no others are grown
@@ -73,7 +75,11 @@ class Search:
         return Grower(graph, self.adjuster, self.native, self.show)
 
     def best_score(self, models: Iterable[MappedModel]) -> float:
-        """Return the score of the best of some models, 0 where there are none."""
+        """Return the score of the best of some models, 0 where there are none.
+
+        Chance explains the pairs of a model that scores 0 as well as its poses do. So a model
+        that another mapper made must score more where the search has found none.
+        """
         scores = [self.scorer.score(mapped.reconstruction) for mapped in models]
         return max(scores, default=0.0)
 

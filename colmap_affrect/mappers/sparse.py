@@ -361,7 +361,12 @@ class _HypothesisTest:
         self.score = score
 
     def _try_colmap(self) -> None:
-        """Take over the poses of COLMAP's own model where the model of these scores higher."""
+        """Take over the poses of COLMAP's own model where the model of these scores higher.
+
+        COLMAP refines an unknown focal length from its one default on as a model grows, and may
+        end elsewhere than the values that the search begins with. Where all are known, it begins
+        at the same values as the search, and a second mapping would cost time for nothing else.
+        """
         search = self.search
         if not search.unknown or search.graph.has_rigs or self.task.previous_models:
             return

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
@@ -71,8 +71,9 @@ class LightGlueOptions(MatcherOptions):
         """Refuse features that the weights were not trained for."""
         if extractor not in ("", "aliked"):
             raise OptionError(
-                f"matching: lightglue takes features of aliked, not of {extractor}; "
-                "use --recipe aliked-lightglue"
+                f"lightglue takes features of aliked, not of {extractor}",
+                where="matching",
+                advice=("use ", Option("recipe"), " aliked-lightglue"),
             )
 
 

@@ -55,7 +55,7 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
         StoreError: when it is damaged, or names other images.
     """
     if not path.is_file():
-        raise OptionError(f"{path}: no such file")
+        raise OptionError("no such file", where=path)
     with path.open("rb") as file:
         is_text = (
             file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE and path.suffix != ".h5"
@@ -126,7 +126,9 @@ def _hloc_pairs(
             one = ", ".join(found[0])
             other = ", ".join(found[1])
             raise StoreError(
-                f"{source.path}: {key} may stand for {one} and {other}; rename the images"
+                f"{key} may stand for {one} and {other}",
+                where=source.path,
+                advice="rename the images",
             )
         if found:
             yield found[0], key
@@ -171,7 +173,7 @@ def _splits(key: str, separator: str, by_key: Mapping[str, str]) -> Iterator[Pai
 def _refuse_unknown(path: Path, keys: Collection[str]) -> None:
     if keys:
         raise StoreError(
-            f"{path}: has matches of images that have no features: {such_as(keys)}"
+            f"has matches of images that have no features: {such_as(keys)}", where=path
         )
 
 
@@ -190,8 +192,9 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
             pair = split_line(line, known)
             if not pair:
                 raise StoreError(
-                    f"{path}: line {number}: {line!r} is not two names of images that have "
-                    "features, nor two numbers of features"
+                    f"line {number}: {line!r} is not two names of images that have "
+                    "features, nor two numbers of features",
+                    where=path,
                 )
             end = _end_of_matches(lines, number)
             if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
@@ -200,7 +203,9 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
             number = end
     if not found:
         raise StoreError(
-            f"{path}: holds no matches; give an HDF5 file, or a list of COLMAP"
+            "holds no matches",
+            where=path,
+            advice="give an HDF5 file, or a list of COLMAP",
         )
     return GivenMatches(
         path=path, pairs=tuple(found), read=lambda _: iter(found.items())

@@ -206,7 +206,7 @@ def read_pairs(
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
     if not len(found):
-        raise OptionError(f"{path}: holds no pair of two different images")
+        raise OptionError("holds no pair of two different images", where=path)
     numbers = np.empty((len(found), 2), np.int32)
     np.divmod(found, len(ordered), out=(numbers[:, 0], numbers[:, 1]), casting="unsafe")
     return PairList(ordered, numbers)
@@ -222,16 +222,17 @@ def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Ind
         with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
             found = np.fromiter(_codes(file, names, folders, problems), np.int64)
     except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
+        raise OptionError(f"cannot be read ({error.strerror})", where=path) from error
     except UnicodeDecodeError as error:
-        raise OptionError(not_utf_8(path)) from error
+        raise not_utf_8(path) from error
     if problems:
         (line_number, line) = problems[0]
         more = len(problems) - 1
         others = f", nor are {more} more lines" if more else ""
         raise OptionError(
-            f"{path}: line {line_number}: {clipped(repr(line), MAX_SHOWN)} is not two names of "
-            f"images{_suggestion(line, names)}{others}"
+            f"line {line_number}: {clipped(repr(line), MAX_SHOWN)} is not two names "
+            f"of images{_suggestion(line, names)}{others}",
+            where=path,
         )
     return found
 

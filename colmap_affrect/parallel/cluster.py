@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.parallel.cluster_watch import ClusterWatch
 from colmap_affrect.parallel.executor import Result, Task, in_order
 
@@ -80,9 +80,10 @@ def require_environment(expected: Mapping[str, str]) -> None:
     for key, value in expected.items():
         if found[key] != value:
             raise AffrectError(
-                f"worker on {platform.node()}: {key} is {found[key]}, and {value} on the machine "
-                "that leads the work; results could differ: install the same versions, and have "
-                "files on storage that all machines share, under the same path"
+                f"{key} is {found[key]}, and {value} on the machine that leads the work",
+                where=f"worker on {platform.node()}",
+                advice="results could differ: install the same versions, and have files on "
+                "storage that all machines share, under the same path",
             )
 
 
@@ -119,11 +120,14 @@ def connected(address: str) -> Iterator[Cluster]:
         from distributed import Client, Security
     except ModuleNotFoundError as error:
         raise AffrectError(
-            f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
+            f"{error.name} is not installed",
+            where=Option("scheduler"),
+            advice="pip install 'colmap-affrect[cluster]'",
         ) from error
     if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
         raise OptionError(
-            f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786"
+            "not an address such as tcp://10.0.0.1:8786",
+            where=Option("scheduler", address),
         )
     security = Security()  # as dask's configuration has it
     for name in ("distributed", "distributed.client"):  # errors that matter are raised
@@ -151,8 +155,9 @@ def _with_workers(client: Client, address: str) -> Cluster:
         client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
     except TimeoutError as error:
         raise AffrectError(
-            f"{address}: the cluster has no workers; start some, with 'dask worker {address}' on "
-            "each machine"
+            "the cluster has no workers",
+            where=address,
+            advice=f"start some, with 'dask worker {address}' on each machine",
         ) from error
     return Cluster(client, address)
 
@@ -176,8 +181,9 @@ def _require_scheduler(address: str, security: Security) -> None:
         found = f"{type(error).__name__} {error}".strip()
     if found != "Scheduler":
         raise AffrectError(
-            f"--scheduler {address}: no scheduler answers ({found}); give the address that 'dask "
-            "scheduler' prints"
+            f"no scheduler answers ({found})",
+            where=Option("scheduler", address),
+            advice="give the address that 'dask scheduler' prints",
         )
 
 
@@ -248,18 +254,24 @@ class Cluster:
             yield from in_order(submit, tasks, limit=num_tasks, result=self._result)
         except KilledWorker as error:
             raise AffrectError(
-                f"{self._address}: {error.allowed_failures + 1} workers were lost while working on "
-                "one task, for want of memory perhaps; run the same command again"
+                f"{error.allowed_failures + 1} workers were lost while working on one "
+                "task, for want of memory perhaps",
+                where=self._address,
+                advice="run the same command again",
             ) from error
         except CancelledError as error:
             raise AffrectError(
-                f"{self._address}: the scheduler was lost; start it and run the same command again"
+                "the scheduler was lost",
+                where=self._address,
+                advice="start it and run the same command again",
             ) from error
         except (ModuleNotFoundError, RuntimeError) as error:
             why = error.__cause__ or error
             if not isinstance(why, ModuleNotFoundError):
                 raise
             raise AffrectError(
-                f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
-                f"({why}); install it on all machines of the cluster"
+                "scheduler or workers do not have this version of colmap-affrect "
+                f"({why})",
+                where=self._address,
+                advice="install it on all machines of the cluster",
             ) from error

@@ -67,8 +67,8 @@ class ClusterWatch:
         lost_s = now - self._lost_since_s
         if lost_s >= GIVE_UP_AFTER_S:
             raise AffrectError(
-                f"{self._address}: {fault}, and run the same command again: what was done before "
-                "is kept"
+                f"{fault}, and run the same command again: what was done before is kept",
+                where=self._address,
             )
         if lost_s >= WARN_AFTER_S and not self._has_warned:
             self._has_warned = True

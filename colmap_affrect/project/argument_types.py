@@ -65,12 +65,14 @@ def require_type(name: str, value: Any, kind: Any) -> None:
     if _fits(value, kind):
         return
     if kind is bool:
-        raise OptionError(f"{name}={_shown(value)}: give True or False")
+        raise OptionError("give True or False", where=f"{name}={_shown(value)}")
     if get_origin(kind) is Literal:
         known = ", ".join(map(str, get_args(kind)))
         raise OptionError(f"{name} {_shown(value)} is not one of {known}")
     raise OptionError(
-        f"{name}: {_shown(value)} is {type(value).__name__}; give {_name_of(kind)}"
+        f"{_shown(value)} is {type(value).__name__}",
+        where=name,
+        advice=f"give {_name_of(kind)}",
     )
 
 

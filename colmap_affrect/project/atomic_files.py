@@ -50,7 +50,9 @@ def replace_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     except UnicodeEncodeError as error:
         name = error.object[max(0, error.start - 40) : error.end + 40]
         raise WorkspaceError(
-            f"{path}: cannot hold {name!r}, which is not UTF-8; rename that file or folder"
+            f"cannot hold {name!r}, which is not UTF-8",
+            where=path,
+            advice="rename that file or folder",
         ) from error
     except OSError as error:
         raise cannot_write(path, error) from error
@@ -124,12 +126,16 @@ def cannot_write(path: Path, error: Exception) -> WorkspaceError:
     may_be_gone = isinstance(error, FileNotFoundError) or not isinstance(error, OSError)
     if may_be_gone and not os.path.exists(final.parent):  # noqa: PTH110 - never fails
         return WorkspaceError(
-            f"{final}: cannot be written, its folder is gone; run the same command again"
+            "cannot be written, its folder is gone",
+            where=final,
+            advice="run the same command again",
         )
     reason = getattr(error, "strerror", None) or error
     return WorkspaceError(
-        f"{final}: cannot be written ({reason}); free space on the disk, or permit writing, "
-        "and run the same command again: what was done before is kept"
+        f"cannot be written ({reason})",
+        where=final,
+        advice="free space on the disk, or permit writing, and run the same command "
+        "again: what was done before is kept",
     )
 
 

@@ -40,7 +40,9 @@ class GivenFile:
                 groups.append(key.removesuffix(ending))
         if self.shapes and not groups:
             raise StoreError(
-                f"{self.path}: holds no '{dataset}' of images; is it a file of hloc?"
+                f"holds no '{dataset}' of images",
+                where=self.path,
+                advice="is it a file of hloc?",
             )
         return sorted(groups)
 
@@ -65,11 +67,11 @@ class GivenFile:
         if stored != expected + shape[1:]:
             wanted = str(shape).replace("None", "N")
             raise StoreError(
-                f"{self.path}: {key} has shape {stored}, expected {wanted}"
+                f"{key} has shape {stored}, expected {wanted}", where=self.path
             )
         if np.prod([float(size) for size in stored]) > MAX_VALUES:
             raise StoreError(
-                f"{self.path}: {key} of shape {stored} is too large to be true"
+                f"{key} of shape {stored} is too large to be true", where=self.path
             )
         with damage(self.path, MEND):
             num_bytes = self.file[key].nbytes
@@ -91,8 +93,10 @@ def _require_filters(path: Path, dataset: h5py.Dataset) -> None:
         code = properties.get_filter(index)[0]
         if not h5py.h5z.filter_avail(code):
             raise StoreError(
-                f"{path}: {dataset.name[1:]} is compressed by a plugin of HDF5 that is not "
-                f"installed (filter {code}); write the file again with gzip, or without compression"
+                f"{dataset.name[1:]} is compressed by a plugin of HDF5 that is not "
+                f"installed (filter {code})",
+                where=path,
+                advice="write the file again with gzip, or without compression",
             )
 
 
@@ -100,17 +104,21 @@ def _require_filters(path: Path, dataset: h5py.Dataset) -> None:
 def open_given_file(path: Path) -> Iterator[GivenFile]:
     """Open a file for reading; of links nothing is seen, data that are elsewhere are refused."""
     if not path.is_file():
-        raise OptionError(f"{path}: no such file")
+        raise OptionError("no such file", where=path)
     shapes: dict[str, tuple[int, ...]] = {}
 
     def visit(key: str, item: h5py.Group | h5py.Dataset) -> None:
         if key.count("/") > MAX_DEPTH:
             raise StoreError(
-                f"{path}: has groups in groups, more than {MAX_DEPTH} deep; {MEND}"
+                f"has groups in groups, more than {MAX_DEPTH} deep",
+                where=path,
+                advice=MEND,
             )
         if isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
-                raise StoreError(f"{path}: data in other files are not followed: {key}")
+                raise StoreError(
+                    f"data in other files are not followed: {key}", where=path
+                )
             shapes[key] = item.shape or ()
 
     with damage(path, f"or still being written; {MEND}"):

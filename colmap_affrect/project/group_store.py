@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import StoreError, damage, how_to_make_again
+from colmap_affrect.errors import Option, StoreError, damage, how_to_make_again
 from colmap_affrect.project import atomic_files
 from colmap_affrect.project.regular_files import require_regular
 
@@ -53,7 +53,7 @@ class GroupStore:
         self, where: Path | atomic_files.FileTransaction, mode: str
     ) -> Iterator[h5py.File]:
         advice = how_to_make_again(self.stage, self.path.parent)
-        with damage(self.path, f"unless another program has it open, {advice}"):
+        with damage(self.path, ("unless another program has it open, ", advice)):
             atomic_files.apply_journal(self.path)
             require_regular(self.path)
             with h5py.File(where, mode) as file:
@@ -62,8 +62,9 @@ class GroupStore:
                 found = file.attrs.get("format")
                 if found != self.format:
                     raise StoreError(
-                        f"{self.path}: expected the format {self.format}, found {found}; use "
-                        "another --output-path"
+                        f"expected the format {self.format}, found {found}",
+                        where=self.path,
+                        advice=("use another ", Option("output-path")),
                     )
                 yield file
 

@@ -9,7 +9,7 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.group_store import GroupStore, entries_of, read_checked
 from colmap_affrect.project.match_state import Names
-from colmap_affrect.project.stores import pair_key
+from colmap_affrect.project.match_store import pair_key
 
 
 @dataclass(frozen=True)

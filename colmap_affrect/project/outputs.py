@@ -68,8 +68,9 @@ def refuse_link(path: Path) -> None:
     """Refuse to write where a symbolic link stands: it would be followed; OptionError."""
     if path.is_symlink():
         raise OptionError(
-            f"{path}: is a symbolic link, and nothing is written where it leads; remove it, or "
-            "give another name or folder"
+            "is a symbolic link, and nothing is written where it leads",
+            where=path,
+            advice="remove it, or give another name or folder",
         )
 
 
@@ -86,8 +87,9 @@ def refuse_photographs(target: Path, names: Collection[str]) -> None:
         with suppress(OSError):  # a name that is too long, for one
             if all((folder / name).is_file() for name in inner):
                 raise OptionError(
-                    f"{target}: lies in the folder of the photographs, {folder}; give another name "
-                    "or folder"
+                    f"lies in the folder of the photographs, {folder}",
+                    where=target,
+                    advice="give another name or folder",
                 )
 
 
@@ -98,7 +100,7 @@ def refuse_what_waits(path: Path) -> None:
             require_regular(path)
     except NotAFileError as error:
         raise OptionError(
-            f"{path}: {error}; remove it, or give another folder"
+            error, where=path, advice="remove it, or give another folder"
         ) from error
 
 
@@ -161,8 +163,9 @@ def _refuse_models_of_a_run(target: Path) -> None:
     for folder in target.parents:
         if folder.name == "sparse" and is_output_folder(folder.parent):
             raise OptionError(
-                f"{target}: lies beside the models of a run, which mapping removes; give another "
-                "name or folder"
+                "lies beside the models of a run, which mapping removes",
+                where=target,
+                advice="give another name or folder",
             )
 
 
@@ -170,7 +173,9 @@ def _refuse_existing(targets: Iterable[Path]) -> None:
     for target in targets:
         if os.path.lexists(target):
             raise OptionError(
-                f"{target}: exists, and is left as it is; give another name or folder"
+                "exists, and is left as it is",
+                where=target,
+                advice="give another name or folder",
             )
 
 
@@ -230,7 +235,9 @@ def remove_own(paths: Iterable[Path]) -> None:
         except OSError as error:  # of a file in it the name alone
             why = error.strerror or error
             raise WorkspaceError(
-                f"{path}: cannot be removed ({why}); permit that, and run the same command again"
+                f"cannot be removed ({why})",
+                where=path,
+                advice="permit that, and run the same command again",
             ) from error
 
 

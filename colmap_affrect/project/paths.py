@@ -27,14 +27,16 @@ def as_path(given: PathLike, argument: str = "") -> Path:
         kind = type(given).__name__
         named = f"{argument}={given!r}" if argument else repr(given)
         raise OptionError(
-            f"{named}: give a path as str or os.PathLike, not {kind}"
+            f"give a path as str or os.PathLike, not {kind}", where=named
         ) from error
     if not os.fspath(
         given
     ):  # Path takes it for the current folder, and nobody means that
-        raise OptionError("an empty text is no path; the current folder is '.'")
+        raise OptionError(
+            "an empty text is no path", advice="the current folder is '.'"
+        )
     if "\0" in str(path):
-        raise OptionError(f"{str(path)!r}: no path holds the character 0")
+        raise OptionError("no path holds the character 0", where=f"{str(path)!r}")
     return path
 
 
@@ -56,6 +58,8 @@ def resolved(path: Path) -> Path:
         whole = path.resolve()
     except RuntimeError as error:  # so Python says it
         raise OptionError(
-            f"{path}: links lead in a circle; give the path of a file or folder itself"
+            "links lead in a circle",
+            where=path,
+            advice="give the path of a file or folder itself",
         ) from error
     return path.absolute() if path.exists() and not whole.exists() else whole

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import tomli_w
 from pydantic import BaseModel, ConfigDict
 
-from colmap_affrect.errors import WorkspaceError, clipped, damage
+from colmap_affrect.errors import Option, WorkspaceError, clipped, damage
 from colmap_affrect.options import flat
 from colmap_affrect.project.regular_files import read_regular_text, sha256_of_regular
 
@@ -144,13 +144,19 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {}
-    other = f"use another --output-path than {path.parent}"
-    with damage(path, mend=f"restore it, or {other}", error_class=WorkspaceError):
+    mend = (
+        "restore it, or use another ",
+        Option("output-path"),
+        f" than {path.parent}",
+    )
+    with damage(path, mend, WorkspaceError):
         values = tomllib.loads(read_regular_text(path))
         if values.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
-                f"{path.parent}: was made by another version of colmap-affrect, which cannot be "
-                "gone on with; use another --output-path or remove it"
+                "was made by another version of colmap-affrect, which cannot be gone "
+                "on with",
+                where=path.parent,
+                advice=("use another ", Option("output-path"), " or remove it"),
             )
         record = _Record(**values).model_dump(exclude_unset=True)
         unknown = record.keys() - set(KEYS)

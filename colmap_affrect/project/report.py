@@ -12,6 +12,7 @@ from typing import Any
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
+from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
@@ -138,10 +139,15 @@ class StageReport(Summarized):
     """Images, pairs, cameras or models that were made now."""
     num_kept: int = 0
     """Those that were there already."""
-    failures: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, ImageFailure] = field(default_factory=dict)
     """Why images cannot be used, by their names."""
     warned: tuple[StageWarning, ...] = ()
     """What went less well than asked for."""
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why images cannot be used, in words, by their names."""
+        return {name: why.text() for name, why in self.failed.items()}
 
     @property
     def warnings(self) -> dict[str, str]:
@@ -150,13 +156,15 @@ class StageReport(Summarized):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
+        failed = {name: why.to_mapping() for name, why in self.failed.items()}
         warned = [warning.to_mapping() for warning in self.warned]
-        return {**asdict(self), "warnings": self.warnings, "warned": warned}
+        in_words = {"failures": self.failures, "warnings": self.warnings}
+        return {**asdict(self), **in_words, "failed": failed, "warned": warned}
 
     def summary(self) -> str:
         """Return one line."""
         kept = f", {self.num_kept} already there" if self.num_kept else ""
-        failed = f", {len(self.failures)} failed" if self.failures else ""
+        failed = f", {len(self.failed)} failed" if self.failed else ""
         warned = f", {len(self.warnings)} with a warning" if self.warnings else ""
         return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
 

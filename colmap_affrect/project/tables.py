@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from colmap_affrect.errors import OptionError, not_utf_8
+from colmap_affrect.errors import Option, OptionError, Row, not_utf_8
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.regular_files import read_regular_text
 
@@ -22,25 +22,25 @@ def as_row(cells: Sequence[str]) -> str:
     return row.getvalue()
 
 
-class Row(NamedTuple):
-    """A row of a table."""
+class CellsOfRow(NamedTuple):
+    """What a table says in one row."""
 
-    place: str  # the file and the line, for errors
+    place: Row  # for errors
     cells: dict[str, str]  # by column, without empty ones
 
 
 def read_table(
     path: Path,
-    where: str,
+    option: str,
     columns: Sequence[str],
     key: str = "name",
     usual: Sequence[str] = (),
-) -> list[Row]:
+) -> list[CellsOfRow]:
     """Read a CSV file whose first line names its columns, in any order.
 
     Args:
         path: the file.
-        where: what an error begins with, such as ``--cameras-path FILE``.
+        option: that the file came by, for errors; such as ``cameras-path``.
         columns: that the table may have.
         key: column that it must have; empty for none.
         usual: columns of a table without a header, whose first line names no column; empty where
@@ -52,6 +52,7 @@ def read_table(
     Raises:
         OptionError: the file cannot be read, or is no such table.
     """
+    where = Option(option, path)
     lines = _read_lines(path, where)
     header = [cell.lower() for cell in lines[0][1]] if lines else []
     if usual and header and not set(header).intersection(columns):
@@ -63,16 +64,19 @@ def read_table(
     for number, cells in lines:
         if len(cells) > len(header):
             raise OptionError(
-                f"{where}, line {number}: has {len(cells)} cells and the first line {len(header)}; "
-                'values with commas need quotes, "1437,1440,792,524"'
+                f"has {len(cells)} cells and the first line {len(header)}",
+                where=Row(where, f"line {number}"),
+                advice='values with commas need quotes, "1437,1440,792,524"',
             )
-        named = zip(header, cells, strict=False)
-        values = {column: cell for column, cell in named if cell}
-        rows.append(Row(f"{where}, line {number}", values))
+        values = {}
+        for column, cell in zip(header, cells, strict=False):
+            if cell:
+                values[column] = cell
+        rows.append(CellsOfRow(Row(where, f"line {number}"), values))
     return rows
 
 
-def _read_lines(path: Path, where: str) -> list[tuple[int, list[str]]]:
+def _read_lines(path: Path, where: Option) -> list[tuple[int, list[str]]]:
     """Return the number and the cells of each line that is not empty."""
     lines = []
     try:
@@ -83,28 +87,29 @@ def _read_lines(path: Path, where: str) -> list[tuple[int, list[str]]]:
             if any(cells):
                 lines.append((reader.line_num, cells))
     except UnicodeDecodeError as error:
-        raise OptionError(not_utf_8(where)) from error
+        raise not_utf_8(where) from error
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
-        raise OptionError(f"{where}: cannot be read ({reason})") from error
+        raise OptionError(f"cannot be read ({reason})", where=where) from error
     return lines
 
 
 def _check_header(
-    header: Sequence[str], where: str, columns: Sequence[str], key: str
+    header: Sequence[str], where: Option, columns: Sequence[str], key: str
 ) -> None:
     """Refuse a header with other columns, twice the same one, or without the key; OptionError."""
     if len(header) == 1 and ";" in header[0]:
         raise OptionError(
-            f"{where}: separate cells by commas, and write numbers with a point"
+            "separate cells by commas, and write numbers with a point", where=where
         )
     for column in header:
         if column not in columns:
             raise OptionError(
-                f"{where}: unknown column '{column}'{suggestion(column, sorted(columns))}"
+                f"unknown column '{column}'{suggestion(column, sorted(columns))}",
+                where=where,
             )
     if (key and key not in header) or len(set(header)) < len(header):
         must = key or columns[0]
         raise OptionError(
-            f"{where}: its first line must have the column '{must}', and each once"
+            f"its first line must have the column '{must}', and each once", where=where
         )

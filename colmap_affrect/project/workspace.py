@@ -11,7 +11,13 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import ConflictError, OptionError, WorkspaceError
+from colmap_affrect.errors import (
+    ConflictError,
+    Option,
+    OptionError,
+    Words,
+    WorkspaceError,
+)
 from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.paths import resolved
@@ -84,7 +90,7 @@ class Workspace:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         if database_path.is_dir():  # '.' and '/' have no names
             raise OptionError(
-                f"{database_path}: is a folder; give the path of a database"
+                "is a folder", where=database_path, advice="give the path of a database"
             )
         return cls(database_path.with_suffix(".affrect"), database_path)
 
@@ -108,8 +114,9 @@ class Workspace:
         """Refuse the folder of a run for results of another kind; OptionError."""
         if self.config.exists():
             raise OptionError(
-                f"{self.path}: has the results of a run, some of which would be replaced; use "
-                "another --output-path"
+                "has the results of a run, some of which would be replaced",
+                where=self.path,
+                advice=("use another ", Option("output-path")),
             )
 
     def require_own(self, photographs: Path | None = None) -> None:
@@ -119,26 +126,35 @@ class Workspace:
         """
         if photographs and resolved(self.path) == resolved(photographs):
             raise OptionError(
-                f"{self.path}: is the folder of the photographs; give another one as --output-path"
+                "is the folder of the photographs",
+                where=self.path,
+                advice=("give another one as ", Option("output-path")),
             )
         if os.path.lexists(self.path) and not self.path.is_dir():
             raise OptionError(
-                f"{self.path}: is not a folder; give a new or an empty one as --output-path"
+                "is not a folder",
+                where=self.path,
+                advice=("give a new or an empty one as ", Option("output-path")),
             )
         with suppress(OSError):  # not there, or refused when it is to be used
-            foreign = []
-            for path in self.path.iterdir():
-                stem = path.name.partition(".")[0]
-                if stem in OWN_STEMS or path.name == outputs.LOCK:
-                    outputs.refuse_link(path)
-                    outputs.refuse_what_waits(path)
-                if not _may_be_ours(path):
-                    foreign.append(path.name)
-            if foreign and not outputs.is_output_folder(self.path):
+            self._refuse_links_and_pipes()
+            names = [
+                path.name for path in self.path.iterdir() if not _may_be_ours(path)
+            ]
+            if names and not outputs.is_output_folder(self.path):
                 raise OptionError(
-                    f"{self.path}: is not empty ({min(foreign)}) and was not made by "
-                    "colmap-affrect; give a new or an empty folder as --output-path"
+                    f"is not empty ({min(names)}) and was not made by colmap-affrect",
+                    where=self.path,
+                    advice=("give a new or an empty folder as ", Option("output-path")),
                 )
+
+    def _refuse_links_and_pipes(self) -> None:
+        """Refuse what has the name of a file of ours, and leads elsewhere or cannot be read."""
+        for path in self.path.iterdir():
+            stem = path.name.partition(".")[0]
+            if stem in OWN_STEMS or path.name == outputs.LOCK:
+                outputs.refuse_link(path)
+                outputs.refuse_what_waits(path)
 
     def begin(self) -> None:
         """Make the folder, unless it is there, and say in its log whose it is."""
@@ -153,7 +169,8 @@ class Workspace:
 
     def _unusable(self, error: OSError) -> WorkspaceError:
         return WorkspaceError(
-            f"{self.path}: cannot be used as output folder ({error.strerror or error})"
+            f"cannot be used as output folder ({error.strerror or error})",
+            where=self.path,
         )
 
     @contextmanager
@@ -167,8 +184,9 @@ class Workspace:
             lock = FileLock(self.path / outputs.LOCK).acquire(timeout=LOCK_WAIT_S)
         except Timeout as error:
             raise WorkspaceError(
-                f"{self.path}: another colmap-affrect is working in this folder; wait for it "
-                "or use another --output-path"
+                "another colmap-affrect is working in this folder",
+                where=self.path,
+                advice=("wait for it or use another ", Option("output-path")),
             ) from error
         except OSError as error:
             raise self._unusable(error) from error
@@ -235,11 +253,17 @@ class Workspace:
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; OptionError when it was not run."""
         if stage not in self.started_stages:
-            first = f"run 'colmap-affrect {stage}' with this --output-path first"
+            first: Words = (
+                f"run 'colmap-affrect {stage}' with this ",
+                Option("output-path"),
+                " first",
+            )
             if self.users_database:
                 first = "call extract_features first, or move this folder along with its database"
             raise OptionError(
-                f"{self.path}: the {stage} stage has not been run there; {first}"
+                f"the {stage} stage has not been run there",
+                where=self.path,
+                advice=first,
             )
         return dict(self.record()[stage])
 
@@ -327,7 +351,9 @@ class Workspace:
             )
             if why:
                 raise ConflictError(
-                    f"{self.path}: the {stage} stage was run there with {why}; {self._remedy}"
+                    f"the {stage} stage was run there with {why}",
+                    where=self.path,
+                    advice=self._remedy,
                 )
         changed = {
             **record,
@@ -355,7 +381,7 @@ class Workspace:
         Raises ConflictError for a database of the user.
         """
         if self.users_database:
-            raise ConflictError(f"{self.users_database}: {why}; {self._remedy}")
+            raise ConflictError(why, where=self.users_database, advice=self._remedy)
         self.record_mapping(None)
         results = self._results("verify")
         results.remove(self.sparse)
@@ -363,27 +389,34 @@ class Workspace:
         self._write_record(rewind_record(self.record(), "verify"))
 
     @property
-    def _remedy(self) -> str:
+    def _remedy(self) -> Words:
         if self.users_database:
             return (
                 "use a new database (from_database= takes over its images and cameras)"
             )
-        return "use --overwrite to redo it and the stages after it, or another --output-path"
+        return (
+            "use ",
+            Option("overwrite"),
+            " to redo it and the stages after it, or another ",
+            Option("output-path"),
+        )
 
     def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
         if first in self.started_stages:
             raise ConflictError(
-                f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
-                "use another --output-path"
+                f"the {first} stage was run there, which {stage} cannot go on from",
+                where=self.path,
+                advice=("use another ", Option("output-path")),
             )
         if self.started_stages:
             return
         for path in self._results("extract"):
             if path.exists() and path != self.users_database:
                 raise ConflictError(
-                    f"{path}: exists and was not made here; it is left as it is, use "
-                    "another --output-path"
+                    "exists and was not made here, and is left as it is",
+                    where=path,
+                    advice=("use another ", Option("output-path")),
                 )
 
     def refuse_foreign_models(self) -> None:
@@ -397,8 +430,9 @@ class Workspace:
                     foreign.append(file)
         if foreign:
             raise ConflictError(
-                f"{foreign[0]}: was not made by this run and would be removed with its models; "
-                "move it elsewhere, and run the same command again"
+                "was not made by this run and would be removed with its models",
+                where=foreign[0],
+                advice="move it elsewhere, and run the same command again",
             )
 
     def _results(self, stage: str) -> list[Path]:

@@ -267,9 +267,11 @@ def _of_recipe(context: Context, names: str) -> list[Advice]:
     if workspace.recipe() != STRONGEST:
         why = f"recipe {STRONGEST} tries more for {names}"
         return [Advice(why, _anew(context, "--recipe", STRONGEST))]
-    how = context.resources.how_to_complete(context.extraction).partition(", or ")[0]
+    commands = context.resources.commands_to_complete(context.extraction)
+    if not commands:
+        return []
     why = f"learned matching, where light or age differ, may tie {names}"
-    return [Advice(why, f"{how} && {_again(context)}")] if how else []
+    return [Advice(why, f"{commands[0]} && {_again(context)}")]
 
 
 def _again(context: Context, *words: str) -> str:

@@ -56,11 +56,15 @@ class Drawn:
             OptionError: something else was sent, or a photograph is not there.
         """
         if not isinstance(content, dict):
-            raise OptionError("the page sent no marks and masks; load it again")
+            raise OptionError(
+                "the page sent no marks and masks", advice="load it again"
+            )
         rows = content.get("marks", [])
         pictures = content.get("masks", {})
         if not (isinstance(rows, list) and isinstance(pictures, dict)):
-            raise OptionError("the page sent no marks and masks; load it again")
+            raise OptionError(
+                "the page sent no marks and masks", advice="load it again"
+            )
         marks = []
         for row in rows:
             marks.append(_mark(row, names))
@@ -124,12 +128,14 @@ def _mark(row: Any, names: Collection[str]) -> Mark:
     point = row[0]
     is_name = isinstance(point, str) and 0 < len(point) <= MAX_NUM_LETTERS
     if not (is_name and point.isprintable()):
-        raise OptionError(f"point {point!r:.50}: give it a short name")
+        raise OptionError("give it a short name", where=f"point {point!r:.50}")
     position = []
     for value in row[2:]:
         is_number = isinstance(value, int | float) and math.isfinite(value)
         if not is_number:
-            raise OptionError(f"point {point}: x and y must be finite numbers of px")
+            raise OptionError(
+                "x and y must be finite numbers of px", where=f"point {point}"
+            )
         position.append(float(value))
     return Mark(point, _known(row[1], names), *position)
 
@@ -137,7 +143,9 @@ def _mark(row: Any, names: Collection[str]) -> Mark:
 def _known(name: Any, names: Collection[str]) -> str:
     """Return the name of a photograph; OptionError if there is none of it."""
     if not isinstance(name, str) or name not in names:
-        raise OptionError(f"{name!r:.200}: no such photograph; load the page again")
+        raise OptionError(
+            "no such photograph", where=f"{name!r:.200}", advice="load the page again"
+        )
     return name
 
 
@@ -157,7 +165,7 @@ def _mask_path(folder: Path, name: str) -> Path:
     """Return where the mask of a photograph is kept; OptionError for names that lead out."""
     path = folder / f"{name}.png"
     if not resolved(path).is_relative_to(resolved(folder)):
-        raise OptionError(f"{name}: is outside of the folder of the photographs")
+        raise OptionError("is outside of the folder of the photographs", where=name)
     return path
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import GrayImage, Mask
-from colmap_affrect.errors import ImageError, OptionError, shown
+from colmap_affrect.errors import ImageError, OptionError, shown, with_flags
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.conventions import HALF_PIXEL
@@ -99,7 +99,7 @@ def camera_from_lines(
     )
     if mask is not None and mask.shape != gray.shape:
         raise OptionError(
-            f"mask: has the shape {mask.shape}, and the photograph {gray.shape}"
+            f"has the shape {mask.shape}, and the photograph {gray.shape}", where="mask"
         )
     return line_report(lines_of(gray, mask), (gray.shape[1], gray.shape[0]))
 
@@ -126,8 +126,8 @@ def report_lines(
         try:
             gray = read_gray(path)
         except ImageError as error:
-            logger.warning("%s", error)
-            found.failures[str(path)] = str(error).removeprefix(f"{path}: ")
+            logger.warning("%s", with_flags(error.words))
+            found.failures[str(path)] = with_flags(error.what)
             continue
         lines = lines_of(gray)
         report = line_report(lines, (gray.shape[1], gray.shape[0]))
@@ -151,8 +151,9 @@ def _gray_values(image: NDArray[Any]) -> GrayImage:
     is_photograph = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if image.dtype != np.uint8 or not is_photograph or not image.size:
         raise OptionError(
-            f"image: is an array of the shape {image.shape} and type {image.dtype}; give (H, W) or "
-            "(H, W, 3) of uint8, or a path"
+            f"is an array of the shape {image.shape} and type {image.dtype}",
+            where="image",
+            advice="give (H, W) or (H, W, 3) of uint8, or a path",
         )
     if image.ndim == 2:
         return np.ascontiguousarray(image)

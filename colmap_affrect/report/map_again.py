@@ -10,7 +10,7 @@ from typing import Any
 
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.errors import AffrectError, one_line
+from colmap_affrect.errors import AffrectError, one_line, with_flags
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.outputs import remove_own
@@ -24,7 +24,7 @@ from colmap_affrect.report.verdict import QUALITIES
 logger = logging.getLogger(__name__)
 
 MapImages = Callable[[ByHand, Progress], RunReport]
-"""Maps the images of a run with what is said by hand, as ``pipeline.map_images`` does."""
+"""Maps the images of a run with what is said by hand, as the stage ``map`` does."""
 
 
 class MapsAgain:
@@ -99,7 +99,7 @@ class MapsAgain:
         try:
             answer = self._map(drawn)
         except AffrectError as error:
-            answer = {"error": one_line(str(error))}
+            answer = {"error": one_line(with_flags(error.words))}
         except Exception as error:  # the page has to hear of it, whatever it is
             logger.exception("mapping has failed")
             answer = {"error": f"mapping has failed, run.log says why: {error!r:.300}"}

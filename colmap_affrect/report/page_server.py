@@ -17,7 +17,13 @@ from socketserver import TCPServer
 from typing import Any
 
 from colmap_affrect.colmap.by_hand import ByHand
-from colmap_affrect.errors import AffrectError, OptionError, one_line
+from colmap_affrect.errors import (
+    AffrectError,
+    Option,
+    OptionError,
+    one_line,
+    with_flags,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.map_again import MapImages, MapsAgain
 from colmap_affrect.report.page import TEMPLATES
@@ -74,8 +80,12 @@ class PageServer(ThreadingHTTPServer):
         """
         if not workspace.page.is_file():
             raise OptionError(
-                f"{workspace.page}: no such page; give the output folder of a run, "
-                "or run it without --no-page"
+                "no such page",
+                where=workspace.page,
+                advice=(
+                    "give the output folder of a run, or run it without ",
+                    Option("no-page"),
+                ),
             )
         self.workspace = workspace
         self.mapping = MapsAgain(workspace, by_hand or ByHand(), map_images)
@@ -84,7 +94,9 @@ class PageServer(ThreadingHTTPServer):
             super().__init__((HOST, port), _Handler)
         except OSError as error:
             raise OptionError(
-                f"--port {port}: is in use; --port 0 takes one that is free"
+                "is in use",
+                where=Option("port", port),
+                advice=(Option("port"), " 0 takes one that is free"),
             ) from error
 
     def server_bind(self) -> None:
@@ -202,7 +214,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError as error:
             self._send_json(HTTPStatus.BAD_REQUEST, {"error": f"not JSON: {error}"})
         except AffrectError as error:
-            answer = {"error": one_line(str(error))}
+            answer = {"error": one_line(with_flags(error.words))}
             self._send_json(HTTPStatus.BAD_REQUEST, answer)
         else:
             status = HTTPStatus.ACCEPTED if has_begun else HTTPStatus.CONFLICT

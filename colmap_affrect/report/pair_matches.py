@@ -88,7 +88,9 @@ class PairReader:
         num_tie_points = len(tie_points[0])
         if not is_matched and not len(inliers) and not num_tie_points:
             raise OptionError(
-                f"{names[0]}, {names[1]}: never matched; give another pair"
+                "never matched",
+                where=f"{names[0]}, {names[1]}",
+                advice="give another pair",
             )
         kinds = self._feature_kinds(names, keypoints, inliers)
         kinds[(kinds != MatchKind.FOREIGN) & ~rows_in(inliers, raw)] = MatchKind.GUIDED

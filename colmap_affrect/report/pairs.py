@@ -14,7 +14,7 @@ import numpy as np
 from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.data import ColorImage
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
@@ -150,12 +150,14 @@ def draw_pair(
             pair = PairReader(ViewGraph(database), Context(workspace)).read(names)
     image_path = image_path or workspace.photographs()
     if not image_path:
-        raise OptionError("--image-path: give the folder of the photographs")
+        raise OptionError(
+            "give the folder of the photographs", where=Option("image-path")
+        )
     stems = [name.replace("/", "-").rpartition(".")[0] for name in names]
     target = picture_path or path / "pairs" / fitting_name("--".join(stems), ".png")
     if target.suffix != ".png" or not (is_run or picture_path):
         raise OptionError(
-            "--output-path: give the name of a new file that ends in .png"
+            "give the name of a new file that ends in .png", where=Option("output-path")
         )
     text = f"{names[0]} and {names[1]}: {pair.text}"
     photographs = [read_color(image_path / name, SHEET_SIDE_PX) for name in names]

@@ -16,6 +16,7 @@ from colmap_affrect.mappers.camera_priors import (
     focal_contradictions,
 )
 from colmap_affrect.options import documented
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.reasons import text_of
 from colmap_affrect.project.report import (
@@ -25,7 +26,6 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
 )
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.photographs import PhotographReport, quality_of
 from colmap_affrect.session.context import Context
@@ -68,7 +68,8 @@ class RunReport(ReconstructionReport):
             raise NoModelError(self.why_no_model)
         if number not in range(len(self.models)):
             raise OptionError(
-                f"number={number!r}: the models are 0 to {len(self.models) - 1}"
+                f"the models are 0 to {len(self.models) - 1}",
+                where=f"number={number!r}",
             )
         return pycolmap.Reconstruction(Workspace(self.output_path).sparse / str(number))
 

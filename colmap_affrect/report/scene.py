@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, with_flags
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.upright import upright_rotation
 from colmap_affrect.report.observations import observations_of, registered_images
@@ -100,7 +100,7 @@ def read_view(
     try:
         model = read_given_model(path)
     except AffrectError as error:
-        return View3D(note=f"The model cannot be shown: {error}")
+        return View3D(note=f"The model cannot be shown: {with_flags(error.words)}")
     upright = upright_of_run(path, model)
     fit_upright(model, None if upright is None else upright.direction)
     return replace(view_of(model, max_num_observations), kinds=kinds)

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import pydantic
 
 from colmap_affrect.mappers.camera_priors import FocalContradiction
+from colmap_affrect.project.image_failures import FailureCode
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import DoubtCode, MissingCode
 from colmap_affrect.project.report import Advice, Bridge, MatchedAgain, Residual
@@ -58,6 +59,17 @@ class WarningEntry(pydantic.BaseModel):
     """The warning in words."""
 
 
+class FailureEntry(pydantic.BaseModel):
+    """Why a photograph cannot be used: beside these two, the numbers and names of the reason."""
+
+    model_config = pydantic.ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    code: FailureCode
+    """Kind of the reason."""
+    text: str
+    """The reason in words."""
+
+
 class StageEntry(Described):
     """One stage of a run."""
 
@@ -70,7 +82,9 @@ class StageEntry(Described):
     num_kept: int
     """Those that were there already."""
     failures: dict[str, str]
-    """Why images cannot be used, by their names."""
+    """Why images cannot be used, in words, by their names."""
+    failed: dict[str, FailureEntry]
+    """The same with codes."""
     warnings: dict[str, str]
     """What went less well than asked for, in words, by what it is about."""
     warned: list[WarningEntry]

@@ -10,7 +10,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.errors import NoModelError, OptionError
+from colmap_affrect.errors import NoModelError, Option, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.mapping import model_folders, read_summaries
 from colmap_affrect.progress import SILENT, Progress
@@ -109,9 +109,15 @@ MARK = "<title>Before and after"
 def _refuse_others(path: Path) -> None:
     """Refuse to replace a file that is no such page."""
     if path.is_dir():
-        raise OptionError(f"{path}: is a folder; give the path of an HTML file")
+        raise OptionError(
+            "is a folder", where=path, advice="give the path of an HTML file"
+        )
     if path.exists() and MARK not in path.read_text("utf-8", errors="replace"):
-        raise OptionError(f"{path}: is there already; give another --output-path")
+        raise OptionError(
+            "is there already",
+            where=path,
+            advice=("give another ", Option("output-path")),
+        )
 
 
 @dataclass(frozen=True)
@@ -128,7 +134,9 @@ class _Side:
         sparse = path / "sparse" if (path / "sparse").is_dir() else path
         folders = model_folders(sparse)
         if not folders:
-            raise NoModelError(f"{path}: has no model; give the output folder of a run")
+            raise NoModelError(
+                "has no model", where=path, advice="give the output folder of a run"
+            )
         return cls(folders[0], read_given_model(folders[0]), read_summaries(sparse))
 
     @property

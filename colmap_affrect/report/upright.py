@@ -17,8 +17,8 @@ from colmap_affrect.geometry.lines import (
     upright_of,
 )
 from colmap_affrect.geometry.upright import agreed_up, upright_rotation
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.paths import resolved
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)

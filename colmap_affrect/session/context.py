@@ -12,7 +12,7 @@ from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import AffrectError, ImageError, OptionError
-from colmap_affrect.features.weights import WEIGHT_FILES, find, install_hint
+from colmap_affrect.features.weights import commands_for, find
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import (
     CameraOptions,
@@ -30,12 +30,13 @@ from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairList, PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.guided_store import GuidedStore
+from colmap_affrect.project.match_store import MatchStore
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.paths import GivenPath, resolved
 from colmap_affrect.project.record import Content, ModelInputs, content_of, file_sha256
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 from colmap_affrect.session.view_graph import ViewGraph
@@ -83,7 +84,7 @@ class Inputs(Options):
         known = read_names(Path(self.from_database))
         if not known:
             raise ImageError(
-                f"{self.from_database}: holds no images; import some first"
+                "holds no images", where=self.from_database, advice="import some first"
             )
         if not self.image_list_path:
             return checked_names(folder, names=known, where=self.from_database)
@@ -91,7 +92,7 @@ class Inputs(Options):
         unknown = sorted(set(names) - set(known))
         if unknown:
             raise OptionError(
-                f"{listed}: lists {unknown[0]}, which {self.from_database} has not"
+                f"lists {unknown[0]}, which {self.from_database} has not", where=listed
             )
         return names
 
@@ -150,8 +151,9 @@ class Inputs(Options):
         read_given_cameras(self.cameras)
         if self.from_database and self.cameras != CameraOptions():
             raise OptionError(
-                f"the cameras of {self.from_database} are used; leave out camera mode, model and "
-                "parameters, and other options of cameras"
+                f"the cameras of {self.from_database} are used",
+                advice="leave out camera mode, model and parameters, and other options of "
+                "cameras",
             )
 
     def check_names(self, names: Sequence[str]) -> list[StageWarning]:
@@ -205,11 +207,9 @@ class Resources(Options):
             if number == 0 or missing.isdisjoint(level.weights)
         ]
 
-    def how_to_complete(self, options: ExtractionOptions) -> str:
-        """Return how to get what other levels wait for; empty if none does."""
-        keys = self._missing_weights(options)
-        hint = install_hint(WEIGHT_FILES[key] for key in keys)
-        return f"{hint}colmap-affrect weights fetch {' '.join(keys)}" if keys else ""
+    def commands_to_complete(self, options: ExtractionOptions) -> list[str]:
+        """Return commands each of which gets what other levels wait for; none if none does."""
+        return commands_for(self._missing_weights(options))
 
     def _missing_weights(self, options: ExtractionOptions) -> list[str]:
         return [key for key in options.weights if not find(key, self.weights_path)]
@@ -221,8 +221,9 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
     for key in sorted(found.keys() | digests.keys()):
         if found.get(key) != digests.get(key):
             raise AffrectError(
-                f"{weights.get(key, key)}: is not the file {key} of the machine that leads the "
-                "work; give both the same"
+                f"is not the file {key} of the machine that leads the work",
+                where=weights.get(key, key),
+                advice="give both the same",
             )
 
 
@@ -299,8 +300,9 @@ class Context:
         self.workspace.require("pairs")
         if not path.exists():
             raise AffrectError(
-                f"{path}: no such file, the photographs have changed; run 'colmap-affrect pairs' "
-                "and then match again"
+                "no such file, the photographs have changed",
+                where=path,
+                advice="run 'colmap-affrect pairs' and then match again",
             )
         names = self.features.names()
         return lists.read_pairs(path, names) if len(names) > 1 else PairList.of(())

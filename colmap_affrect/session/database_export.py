@@ -12,6 +12,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.image_import import import_images, record_cameras
 from colmap_affrect.pairs.lists import Pair, PairList
+from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.session.view_graph import ViewGraph
@@ -28,7 +29,7 @@ def start_database(workspace: Workspace, inputs: Inputs) -> None:
 
 def add_images(
     workspace: Workspace, graph: ViewGraph, inputs: Inputs, names: Sequence[str]
-) -> dict[str, str]:
+) -> dict[str, ImageFailure]:
     """Add the images that the database lacks.
 
     Args:
@@ -59,13 +60,12 @@ def add_images(
         initial=initial_cameras,
         known=known,
     )
-    return dict.fromkeys(
-        rejected,
-        f"COLMAP cannot read it, or does not take it (camera mode {inputs.cameras.mode})",
-    )
+    mode = inputs.cameras.mode
+    why = ImageFailure("refused_by_colmap", values={"camera_mode": mode})
+    return dict.fromkeys(rejected, why)
 
 
-def write_images_and_keypoints(context: Context) -> dict[str, str]:
+def write_images_and_keypoints(context: Context) -> dict[str, ImageFailure]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     store = context.features
     graph = context.graph

@@ -44,8 +44,8 @@ class ViewGraph:
         self._inliers: dict[Pair, Indices] | None = None
         self._digest = ""
         self._is_kept_open = False
-        self._open = ExitStack()  # closes what is kept open
-        self._kept: pycolmap.Database | None = None
+        self._closing = ExitStack()  # of the database that is kept open
+        self._database: pycolmap.Database | None = None
 
     @contextmanager
     def keep_open(self) -> Iterator[None]:
@@ -59,8 +59,8 @@ class ViewGraph:
 
     def close(self) -> None:
         """Close a database that is kept open; it is opened again when it is next asked for."""
-        self._kept = None
-        self._open.close()
+        self._database = None
+        self._closing.close()
 
     @contextmanager
     def open_to_read(self) -> Iterator[pycolmap.Database]:
@@ -70,14 +70,14 @@ class ViewGraph:
                 yield database
             return
         self._forget_if_gone()
-        if self._kept is None:
-            self._kept = self._open.enter_context(open_database(self.path))
+        if self._database is None:
+            self._database = self._closing.enter_context(open_database(self.path))
         try:
-            yield self._kept
+            yield self._database
         except RuntimeError as error:
-            self._kept = None
+            self._database = None
             # What has opened it makes one line of pycolmap's errors.
-            self._open.__exit__(type(error), error, error.__traceback__)
+            self._closing.__exit__(type(error), error, error.__traceback__)
             raise
 
     @contextmanager

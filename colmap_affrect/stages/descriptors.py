@@ -95,7 +95,7 @@ def match_feature_sets(
         listed = list(map(_two, pairs))
     unknown = set().union(*listed).difference(features)
     if unknown:
-        raise OptionError(f"{min(unknown)}: is in a pair, and has no features")
+        raise OptionError("is in a pair, and has no features", where=min(unknown))
     found = dict[Pair, Matches]()
     with progress.stage("match", len(listed), "pairs") as advance:
         matched = iterate_descriptor_matches(
@@ -132,8 +132,9 @@ def iterate_descriptor_matches(
         if len(sizes) > 1:
             first, second = sizes.items()
             raise OptionError(
-                f"{first[1]} has descriptors of {first[0]} values and {second[1]} of {second[0]}; "
-                "match images of one kind of features"
+                f"{first[1]} has descriptors of {first[0]} values and {second[1]} of "
+                f"{second[0]}",
+                advice="match images of one kind of features",
             )
         return matcher.prepare(image)
 
@@ -149,7 +150,7 @@ def iterate_descriptor_matches(
 def _two(pair: Iterable[str]) -> Pair:
     names = tuple(pair)
     if len(names) != 2:
-        raise OptionError(f"pairs: {names!r} is not two names of images")
+        raise OptionError(f"{names!r} is not two names of images", where="pairs")
     return names
 
 
@@ -160,16 +161,17 @@ def _as_features(name: str, given: Arrays) -> ImageFeatures:
     except (TypeError, ValueError, RuntimeError) as error:  # numpy's, torch's, or not 2
         why = " ".join(str(error).split())
         raise OptionError(
-            f"{name}: give keypoints and descriptors as two arrays ({why})"
+            f"give keypoints and descriptors as two arrays ({why})", where=name
         ) from error
     _check_arrays(name, points, rows)
     unit = unit_rows(rows)
     if not np.isfinite(unit).all():
-        raise OptionError(f"{name}: descriptors are not finite")
+        raise OptionError("descriptors are not finite", where=name)
     places = points[:, :2].astype(np.float64)
     for kind in keypoint_problems(places, None):
         check = CHECKS[kind]
-        raise OptionError(f"{check['what']}: {name}; {check['advice']}")
+        fault = f"{check['what']}: {name}"
+        raise OptionError(fault, advice=check["advice"])
     count = len(places)
     lafs = lafs_from_keypoints(
         places, radii_px=np.ones(count), angles_rad=np.zeros(count)
@@ -185,16 +187,21 @@ def _check_arrays(name: str, points: NDArray[Any], rows: NDArray[Any]) -> None:
     are_points = points.ndim == 2 and points.shape[1] >= 2
     if not are_points or rows.ndim != 2 or len(rows) != len(points):
         raise OptionError(
-            f"{name}: keypoints {points.shape} and descriptors {rows.shape} do not fit; give "
-            "(N, 2) places and (N, D) descriptors"
+            f"keypoints {points.shape} and descriptors {rows.shape} do not fit",
+            where=name,
+            advice="give (N, 2) places and (N, D) descriptors",
         )
     if points.dtype.kind not in "fiu":
-        raise OptionError(f"{name}: keypoints are {points.dtype}; give numbers of px")
+        raise OptionError(
+            f"keypoints are {points.dtype}", where=name, advice="give numbers of px"
+        )
     is_sift = rows.dtype.kind in "iu" and rows.shape[1] == SIFT_SIZE
     if rows.dtype.kind != "f" and not is_sift:
         raise OptionError(
-            f"{name}: descriptors are {rows.dtype} of {rows.shape[1]} values; whole numbers are "
-            "taken for SIFT of 128 values, of others give floats (of bits -1.0 and 1.0)"
+            f"descriptors are {rows.dtype} of {rows.shape[1]} values",
+            where=name,
+            advice="whole numbers are taken for SIFT of 128 values, of others give floats "
+            "(of bits -1.0 and 1.0)",
         )
 
 
@@ -270,7 +277,7 @@ def match_database(
                     )
                     advance(1)
             except OptionError as error:
-                raise DatabaseError(f"{path}: {error}") from error
+                raise DatabaseError(error, where=path) from error
     return len(todo)
 
 
@@ -324,7 +331,7 @@ def write_given_matches(
         try:
             colmap_database.write_matches(database, ids[first], ids[second], indices)
         except DatabaseError as error:
-            raise StoreError(f"{given.path}: {first}, {second}: {error}") from error
+            raise StoreError(f"{first}, {second}: {error}", where=given.path) from error
         if match_type == "inliers":
             is_calibrated = are_calibrated[first] and are_calibrated[second]
             geometry = pycolmap.TwoViewGeometry()

@@ -12,6 +12,7 @@ from colmap_affrect.errors import (
     ConflictError,
     DatabaseError,
     ImageError,
+    Option,
     StoreError,
     one_line,
     such_as,
@@ -25,11 +26,12 @@ from colmap_affrect.images.photographs import (
 )
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.feature_store import NOT_KNOWN, FeatureStore
+from colmap_affrect.project.image_failures import ImageFailure, UnusableImageError
 from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning, WarningCode
-from colmap_affrect.project.stores import NOT_KNOWN, FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context, Inputs
@@ -110,7 +112,7 @@ def extract(
         wall_s=time.perf_counter() - start,
         num_done=len(set(missing) - failures.keys()),
         num_kept=len(done - failures.keys()),
-        failures=failures,
+        failed=failures,
         warned=(*warned, *warned_of_images),
     )
 
@@ -130,14 +132,15 @@ def _check_source(workspace: Workspace, inputs: Inputs) -> None:
 
 
 def _require_one_usable(
-    folder: Path, names: Sequence[str], failures: Mapping[str, str]
+    folder: Path, names: Sequence[str], failures: Mapping[str, ImageFailure]
 ) -> None:
     if failures:
         require_folder(folder)  # else it has gone with all that was still to come
     if len(failures) == len(names):
-        first = failures[names[0]]
+        first = failures[names[0]].text()
         raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
+            (f"none of the {len(names)} images can be used; the first: ", first),
+            where=folder,
         )
 
 
@@ -209,11 +212,11 @@ def _extract_missing(
     extractor: ImageExtractor,
     names: Sequence[str],
     contents: Mapping[str, Content],
-) -> tuple[dict[str, str], list[StageWarning]]:
+) -> tuple[dict[str, ImageFailure], list[StageWarning]]:
     """Extract images one by one; return why some cannot be used, and warnings of others."""
     store = context.features
     images = [(name, 0) for name in names]
-    failures = dict[str, str]()
+    failures = dict[str, ImageFailure]()
     warned = list[StageWarning]()  # of single images, which are logged one by one
     faded = list[str]()
     white = list[str]()  # images whose mask leaves out nothing
@@ -222,9 +225,9 @@ def _extract_missing(
         closing(extract_images(context, inputs, extractor, images)) as found_images,
     ):
         for name, found in zip(names, found_images, strict=True):
-            if isinstance(found, ImageError):
-                logger.warning("%s", found)
-                failures[name] = str(found)
+            if isinstance(found, UnusableImageError):
+                logger.warning("%s", found.failure.text())
+                failures[name] = found.failure
             else:
                 if not len(found.features):
                     logger.warning("%s: no features (blank or too small?)", name)
@@ -263,7 +266,7 @@ def extract_images(
     inputs: Inputs,
     extractor: ImageExtractor,
     images: Sequence[tuple[str, int]],
-) -> Generator[ExtractedImage | ImageError, None, None]:
+) -> Generator[ExtractedImage | UnusableImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 
     By default there are as many threads as cores and memory allow.
@@ -340,8 +343,13 @@ def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None
         for name in names:
             if name in ids and database.exists_keypoints(ids[name]):
                 raise DatabaseError(
-                    f"{workspace.database}: has other features of {name}; they are not replaced, "
-                    "start a new database from it (from_database, --from-database)"
+                    f"has other features of {name}",
+                    where=workspace.database,
+                    advice=(
+                        "they are not replaced, start a new database from it (",
+                        Option("from-database"),
+                        ")",
+                    ),
                 )
 
 
@@ -360,9 +368,15 @@ def _refuse_other_photographs(
     known = {} if before == image_path else FeatureStore(workspace.features).contents()
     if known and len(_changed(known, contents)) == len(known.keys() & contents.keys()):
         raise ConflictError(
-            f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
-            f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
-            "the results, or another --output-path"
+            f"the extract stage was run there with image_path={before!r}, and none "
+            f"of the photographs in {image_path} is one of them",
+            where=workspace.path,
+            advice=(
+                "use ",
+                Option("overwrite"),
+                " to discard the results, or another ",
+                Option("output-path"),
+            ),
         )
 
 
@@ -439,6 +453,7 @@ def _refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> N
     if changed:
         what = _counted(changed, "changed")[0]
         raise StoreError(
-            f"{context.workspace.features}: {what} since their features were extracted; run "
-            "extract again"
+            f"{what} since their features were extracted",
+            where=context.workspace.features,
+            advice="run extract again",
         )

@@ -23,7 +23,7 @@ from colmap_affrect.colmap.database_copy import (
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, Option, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.given_matches import MatchType, given_matches
@@ -99,10 +99,13 @@ class ForeignDatabase:
     def check(self) -> None:
         """Refuse what names no file, or cameras of other images, before anything is made."""
         if self.image_path and not self.image_path.is_dir():
-            raise OptionError(f"--image-path {self.image_path}: no such folder")
+            raise OptionError(
+                "no such folder", where=Option("image-path", self.image_path)
+            )
         if self.matches_path and self.match_list_path:
             raise OptionError(
-                "--match-list-path: only without --matches-path: it says what to match"
+                ("only without ", Option("matches-path"), ": it says what to match"),
+                where=Option("match-list-path"),
             )
         names = read_names(self.path)
         self.initial_cameras().check_known(names, str(self.path))
@@ -147,7 +150,9 @@ def import_and_verify(
     _match(context, foreign)
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
     if not num_pairs:
-        raise DatabaseError(f"{foreign.path}: has no matches; match its images first")
+        raise DatabaseError(
+            "has no matches", where=foreign.path, advice="match its images first"
+        )
     num_verified = _verify(context, foreign, verification)
     return StageReport(
         name="verify",
@@ -244,14 +249,17 @@ def _match(context: Context, foreign: ForeignDatabase) -> None:
     """Match the images by their descriptors where nobody has matched any."""
     if foreign.matches_path or has_matches(foreign.path):
         if foreign.match_list_path:
-            raise OptionError(f"--match-list-path: {foreign.path} has matches already")
+            raise OptionError(
+                f"{foreign.path} has matches already", where=Option("match-list-path")
+            )
         return
     path = context.workspace.database
     names = described_images(path)
     if len(names) < 2:
         raise DatabaseError(
-            f"{foreign.path}: has no matches, nor descriptors to match by; match its images first, "
-            "or give --matches-path"
+            "has no matches, nor descriptors to match by",
+            where=foreign.path,
+            advice=("match its images first, or give ", Option("matches-path")),
         )
     pairs = None
     if foreign.match_list_path:

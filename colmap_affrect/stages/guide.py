@@ -24,9 +24,10 @@ from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
 from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.guided_store import GuidedPair
+from colmap_affrect.project.match_store import PAIRS_PER_WRITE
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PAIRS_PER_WRITE, FeatureStore
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px

@@ -10,7 +10,7 @@ from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
 from colmap_affrect.colmap.verification import verify
-from colmap_affrect.errors import ConflictError
+from colmap_affrect.errors import ConflictError, Option
 from colmap_affrect.geometry.lines import LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
@@ -61,8 +61,15 @@ def map_images(
     known = None if workspace.lacks_models() else workspace.model_inputs()
     if known and known != inputs and known.extends and not extend:
         raise ConflictError(
-            f"{workspace.sparse}: its model extends another one; give --extend again, or "
-            "--overwrite to map from the beginning"
+            "its model extends another one",
+            where=workspace.sparse,
+            advice=(
+                "give ",
+                Option("extend"),
+                " again, or ",
+                Option("overwrite"),
+                " to map from the beginning",
+            ),
         )
     if known == inputs:
         models = read_summaries(workspace.sparse)

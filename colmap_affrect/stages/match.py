@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError, PartError, StoreError, such_as
+from colmap_affrect.errors import Option, OptionError, PartError, StoreError, such_as
 from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -38,15 +38,11 @@ from colmap_affrect.pairs.lists import (
     ordered_for_reuse,
 )
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import PAIRS_PER_WRITE, MatchStore, PairMatches
 from colmap_affrect.project.record import WEIGHTS, file_sha256
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import (
-    PAIRS_PER_WRITE,
-    FeatureStore,
-    MatchStore,
-    PairMatches,
-)
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Resources, require_same_files
 from colmap_affrect.session.database_export import (
@@ -109,8 +105,11 @@ def _record_options(
     try:
         context.extraction.matchers(options)
     except OptionError as error:
-        other = "other features than those here take 'run' with another --output-path"
-        raise OptionError(f"{error}; {other}") from error
+        other = (
+            "other features than those here take 'run' with another ",
+            Option("output-path"),
+        )
+        raise OptionError(error, advice=other) from error
     weights = load_matchers(context, context.extraction, options)
     record = options.to_mapping()
     if weights:
@@ -143,7 +142,9 @@ def _match_missing(
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance, options.max_num_first)
     wanted = not_well_tied(matches, pairs) if pairs and not is_finished else []
-    with context.progress.stage("match, all features", len(wanted), "pairs") as advance:
+    with context.progress.stage(
+        "match", len(wanted), "pairs", "all features"
+    ) as advance:
         left = _worth_all_features(context, wanted, options, digest)
         advance(len(wanted) - len(left))
         match_pairs(context, left, options, advance)
@@ -363,7 +364,7 @@ def _require_features(
     if lost:
         names_lost = such_as(sorted(lost))
         raise StoreError(
-            f"{store.path}: no features of {names_lost}; run extract first"
+            f"no features of {names_lost}", where=store.path, advice="run extract first"
         )
 
 

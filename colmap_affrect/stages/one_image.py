@@ -17,7 +17,7 @@ from colmap_affrect.data import (
     RectificationPlan,
     in_mask,
 )
-from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
+from colmap_affrect.errors import DepthError, lacks_memory, with_flags
 from colmap_affrect.features.base import (
     EXTRACTORS,
     SHAPES,
@@ -39,6 +39,7 @@ from colmap_affrect.images.lines import lines_of
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.image_failures import UnusableImageError, unusable
 from colmap_affrect.recipes import ExtractionOptions, Level
 from colmap_affrect.rectifiers.base import (
     RECTIFIERS,
@@ -99,7 +100,7 @@ class ImageExtractor:
         sent = digests(self.weights)
         return _prepare_elsewhere, (self.options, self.resources, sent)
 
-    def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
+    def __call__(self, task: ImageTask) -> ExtractedImage | UnusableImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
         path = task.photographs.folder / task.name
         try:
@@ -112,18 +113,22 @@ class ImageExtractor:
                 mask=mask,
                 with_lines=task.level == 0,
             )
-        except ImageError as error:
+        except UnusableImageError as error:
             return error
         except Exception as error:
             if not lacks_memory(error):
                 raise
-            return ImageError(f"{path}: {MEMORY_HINT}")
+            return unusable("no_memory", path)
         size = found.image_size
         expected = task.camera_size
         if expected and expected != size:
-            return ImageError(
-                f"{path}: is {size[0]} x {size[1]} px, and its camera in the database "
-                f"{expected[0]} x {expected[1]} px; give the images that the database is of"
+            return unusable(
+                "camera_of_another_size",
+                path,
+                width=size[0],
+                height=size[1],
+                camera_width=expected[0],
+                camera_height=expected[1],
             )
         return replace(found, mask_is_white=mask is not None and bool(mask.all()))
 
@@ -236,7 +241,7 @@ class ImageExtractor:
         try:
             return self.rectifiers[level].plan(photograph), ""
         except DepthError as error:
-            return RectificationPlan(photograph.size), str(error)
+            return RectificationPlan(photograph.size), with_flags(error.words)
 
     def execute(
         self, photograph: Photograph, plan: RectificationPlan, level: int = 0

@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import AffrectError, such_as
+from colmap_affrect.errors import AffrectError, Option, such_as
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
@@ -129,11 +129,12 @@ def _warn_of_images_without_neighbors(
 ) -> None:
     """Say which photographs have no neighbour by their positions; AffrectError where none has."""
     near = f"within {options.max_distance_m:g} m of another one"
-    advice = "raise --max-distance-m, or choose pairs in another way"
+    advice = ("raise ", Option("max-distance-m"), ", or choose pairs in another way")
     if not pairs and options.methods == ("gps",) and not options.match_list_path:
         raise AffrectError(
-            f"{context.workspace.database}: by its position no photograph was taken {near}; "
-            f"{advice}"
+            f"by its position no photograph was taken {near}",
+            where=context.workspace.database,
+            advice=advice,
         )
     paired = set[str]().union(*pairs)
     lonely = [name for name in names if name not in paired]

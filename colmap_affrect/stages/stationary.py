@@ -24,9 +24,10 @@ from colmap_affrect.geometry.stationary import (
 )
 from colmap_affrect.images.reading import grow_mask
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 

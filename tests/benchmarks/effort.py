@@ -27,7 +27,7 @@ from registration import SUBSETS, Subset
 from colmap_affrect.colmap.model_files import read_poses
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.results import pose_scores
-from colmap_affrect.escalation import climb as climbing
+from colmap_affrect.escalation import map_and_rematch as rematching
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.policy import EFFORTS
 from colmap_affrect.images.photographs import CameraOptions
@@ -98,8 +98,8 @@ def curve(
     rows = list[Row]()
     begun_s = time.process_time()
     wall_s = time.monotonic()
-    map_once = climbing.map_images
-    choose_once = climbing.choose_learned
+    map_once = rematching.map_images
+    choose_once = rematching.choose_learned
 
     def add_row(context: Context) -> None:
         row = looked_at(scene_path, names, context.workspace.sparse)
@@ -123,13 +123,13 @@ def curve(
             add_row(escalation.context)
         return is_chosen
 
-    climbing.map_images = map_images
-    climbing.choose_learned = choose_learned
+    rematching.map_images = map_images
+    rematching.choose_learned = choose_learned
     try:
         run(scene_path / "images", work_path / "out", options, page=False)
     finally:
-        climbing.map_images = map_once
-        climbing.choose_learned = choose_once
+        rematching.map_images = map_once
+        rematching.choose_learned = choose_once
     end = looked_at(scene_path, names, work_path / "out" / "sparse")
     end["cpu_s"] = round(time.process_time() - begun_s, 1)
     end["wall_s"] = round(time.monotonic() - wall_s, 1)

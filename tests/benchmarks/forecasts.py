@@ -84,9 +84,9 @@ def record_run(name: str, image_path: Path, output_path: Path) -> Record:
             record.more = more
             self._note("made")
 
-        def begin(self, name: str, total: int) -> None:
-            self._note("begin", name, total)
-            super().begin(name, total)
+        def begin(self, name: str, total: int, part: str = "") -> None:
+            self._note("begin", name, total, part)
+            super().begin(name, total, part)
 
         def advance(self, num_done: int) -> None:
             self._note("advance", num_done)

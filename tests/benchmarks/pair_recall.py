@@ -23,7 +23,7 @@ from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.pairs.lists import Pair, sequence_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 

@@ -4,140 +4,21 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
-from PIL import Image
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
-from colmap_affrect.cli.parser import COMMANDS as ALL_COMMANDS
-from colmap_affrect.cli.parser import EXAMPLES, VOLUME, build_parser, epilog
 from colmap_affrect.colmap.model_files import model_poses
-from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe, recipe_names
-
-COMMANDS = [
-    "run", "extract", "pairs", "match", "verify", "map", "compare",
-    "evaluate", "inspect", "recipes", "weights", "doctor",
-]  # fmt: skip
-TIMEOUT_S = 60
-
-
-@pytest.mark.parametrize("command", [[], ["run"], ["inspect"], ["recipes"]])
-def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
-    done = call(*command, "--help")
-    assert (done.code, done.stderr) == (0, [])
-    assert (
-        f"colmap-affrect {(command or ['run'])[0]}"
-        in done.stdout.partition("examples:")[2]
-    )
-    assert "Exit codes: 0 done" in done.stdout
-    if not command:
-        assert all(f"    {name} " in done.stdout for name in COMMANDS)
-    elif command[0] not in ("recipes", "weights", "doctor"):
-        assert all(flag in done.stdout for flag in ("--output-path", "--quiet"))
-        assert ("--overwrite" in done.stdout) == (command != ["inspect"])
-
-
-def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
-    parser = build_parser()
-    assert {example.split()[0] for example in EXAMPLES} == {
-        *COMMANDS, "convert", "panoramas", "serve", "show-pair", "show-runs", "lines",
-        "import-h5", "export-h5", "export-database", "export", "align",
-    }  # fmt: skip
-    for example in EXAMPLES:
-        parser.parse_args(example.replace("\\\n", " ").split())
-    shown = epilog("map")
-    assert shown.count("colmap-affrect ") == shown.count("colmap-affrect map ") == 2
-
-
-def test_help_of_many_flags_is_in_groups_that_lack_none() -> None:
-    parser = build_parser()
-    (choices,) = (
-        action.choices for action in parser._actions if action.dest == "command"
-    )
-    for name, (_, flags) in ALL_COMMANDS.items():
-        words = re.split(r"[ |\n,]+", f"{flags} {VOLUME}")
-        given = {word.removesuffix("!").partition("@")[0] for word in words}
-        known = choices[name]._option_string_actions.keys()
-        assert {flag for flag in given if flag.startswith("-")} == known - {
-            "-h",
-            "--help",
-        }, name
-    shown = choices["run"].format_help()
-    first = "usage: colmap-affrect run --image-path PATH --output-path PATH [options]\n"
-    assert shown.startswith(first)
-    titles = re.findall(r"^(\w[\w ]*):$", shown, re.MULTILINE)
-    assert titles == [
-        "options", "photographs", "cameras", "features and pairs", "models", "by hand",
-        "what is printed and drawn", "examples",
-    ]  # fmt: skip
-    most_used = shown.partition("photographs:\n")[0]
-    assert "--camera-mode MODE" in most_used
-    assert "--mapper" not in most_used
-
-
-def test_help_loads_no_heavy_package() -> None:
-    script = (
-        "import sys; from colmap_affrect.cli import main\n"
-        "try: main(['run', '--help'])\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "heavy = {'torch', 'kornia', 'pycolmap', 'cv2', 'h5py', 'matplotlib', 'scipy'}\n"
-        "print('loaded', sorted(heavy & set(sys.modules)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[-1] == "loaded []"
-
-
-def test_recipes_are_listed_with_what_they_need(call: Call) -> None:
-    lines = call("recipes").stdout.splitlines()
-    first, *others = [line.split()[0] for line in lines[::2]]
-    assert (first, sorted([first, *others])) == ("default", recipe_names())
-    needs = {
-        name.split()[0]: line.strip()
-        for name, line in zip(*[iter(lines)] * 2, strict=True)
-    }
-    assert needs["rectified"] == needs["on-demand"] == "needs nothing"
-    assert (
-        needs["default"]
-        == "needs nothing, and uses aliked-n16, lightglue-aliked if it can"
-    )
-    assert needs["dense-affnet"] == "needs affnet, hardnet, orinet"
-    assert needs["depth-planes-recommended"] == "needs depth"
-
-
-def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
-    tmp_path: Path, call: Call
-) -> None:
-    done = call("recipes", "on-demand")
-    assert (done.code, done.stderr) == (0, [])
-    path = tmp_path / "copy.toml"
-    path.write_text(done.stdout)
-    copy = load_recipe(str(path))
-    original = load_recipe("on-demand")
-    assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
-    assert (
-        "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius"
-        in done.stdout
-    )
-
-
-def test_the_name_alone_shows_the_help(call: Call) -> None:
-    assert call() == call("--help")
 
 
 @pytest.mark.parametrize(
@@ -281,135 +162,6 @@ def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made
     assert str(places["NONE"]) in done.stderr[0]
     assert not list(tmp_path.iterdir())
     assert times() == before
-
-
-FACADE = (
-    Path(__file__).parents[2]
-    / "sample_scenes"
-    / "facade"
-    / "images"
-    / "view_5_tilt70.jpg"
-)
-
-
-SMALL = "max_image_size_px=240"
-
-
-def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
-    out = tmp_path / "out č"
-    done = call(
-        "inspect", FACADE, "--output-path", out, "--recipe", "rectified", "--set", SMALL
-    )
-    assert (done.code, done.stderr) == (0, [])
-    sheet = out / "view_5_tilt70-inspection.png"
-    assert sheet.stat().st_size > 50_000
-    assert str(sheet) in done.stdout
-
-
-def test_lines_go_on_past_what_cannot_be_read(tmp_path: Path, call: Call) -> None:
-    bad = tmp_path / "bad.jpg"
-    bad.write_bytes(b"no image")
-    out = tmp_path / "pictures"
-    done = call("lines", bad, FACADE, "--output-path", out)
-    assert done.code == 1
-    assert f"{FACADE}: the lines tell a focal length of " in done.stdout
-    assert f"{bad}: not read: " in done.stdout
-    assert "could not read 1 of the images" in done.stderr[-1]
-    assert (out / f"{FACADE.name}-lines.png").stat().st_size > 50_000
-    again = call("lines", FACADE, "--output-path", out)
-    assert (again.code, again.stdout) == (2, "")  # a picture is there already
-    numbers = json.loads(
-        call("lines", FACADE, bad, "--json", "--max-failures", 1).stdout
-    )
-    assert numbers["photographs"][str(FACADE)]["is_known"]
-    assert list(numbers["failures"]) == [str(bad)]
-
-
-def test_show_pair_draws_matches_of_a_run_and_of_any_database(
-    verified: Path, photos: Path, tmp_path: Path, call: Call
-) -> None:
-    digest = rows_digest(verified / "database.db")
-    names = ["a.png", "side/č.png"]
-    for _ in range(2):  # the second picture takes the place of the first
-        done = call("show-pair", verified, *names)
-        assert (done.code, done.stderr) == (0, [])
-    said, path = done.stdout.splitlines()
-    assert re.match(
-        r"a\.png and side/č\.png: \d+ raw matches of level 0 \(identity\), \d+ inliers, \d+% of",
-        said,
-    )
-    assert path == str(verified / "pairs" / "a--side-č.png")
-    with Image.open(path) as picture:
-        assert picture.format == "PNG"
-        assert picture.width == 1596
-        assert 500 < picture.height < 800
-    copied = tmp_path / "any.db"
-    shutil.copy(verified / "database.db", copied)
-    given = ["show-pair", copied, *names, "--image-path", photos, "--output-path"]
-    done = call(*given, tmp_path / "pair.png")
-    assert (done.code, done.stderr) == (0, [])
-    assert (
-        done.stdout.splitlines()[0]
-        == said.partition(" of level")[0] + ", " + said.split(", ")[1]
-    )
-    before = (tmp_path / "pair.png").read_bytes()
-    done = call(*given, tmp_path / "pair.png")
-    assert (done.code, done.stderr[0].endswith("give another name or folder")) == (
-        2,
-        True,
-    )
-    assert (tmp_path / "pair.png").read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["any.db", "pair.png"]
-    assert rows_digest(verified / "database.db") == digest
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("OUT a.pgn side/č.png", "a.pgn: no such photograph (did you mean 'a.png'?)"),
-        ("OUT a.png a.png", "a.png, a.png: never matched"),
-        (
-            "OUT/database.db a.png side/č.png",
-            "--image-path: give the folder of the photographs",
-        ),
-        (
-            "OUT/database.db a.png side/č.png --image-path PHOTOS",
-            "--output-path: give the name",
-        ),
-        (
-            "OUT a.png side/č.png --output-path NEW/pair.jpg",
-            "new file that ends in .png",
-        ),
-        (
-            "OUT a.png side/č.png --output-path PHOTOS/pair.png",
-            "in the folder of the photographs",
-        ),
-        (
-            "PHOTOS a.png side/č.png",
-            "database.db: no such file; give a COLMAP database",
-        ),
-    ],
-)
-def test_show_pair_says_what_it_lacks_and_makes_nothing(
-    verified: Path,
-    photos: Path,
-    tmp_path: Path,
-    arguments: str,
-    message: str,
-    call: Call,
-) -> None:
-    for name, path in {
-        "OUT": verified,
-        "PHOTOS": photos,
-        "NEW": tmp_path / "new",
-    }.items():
-        arguments = arguments.replace(name, str(path))
-    before = sorted(photos.rglob("*"))
-    done = call("show-pair", *arguments.split())
-    assert (done.code, done.stdout, len(done.stderr)) == (2, "", 1)
-    assert message in done.stderr[0]
-    assert sorted(photos.rglob("*")) == before
-    assert not list(tmp_path.iterdir())
 
 
 def test_page_of_a_run_has_pictures_of_pairs(verified: Path, call: Call) -> None:

@@ -15,7 +15,7 @@ import pytest
 from command import on_photographs, run_in_process_of_its_own, start
 from exported_model import write_model
 
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 TIMEOUT_S = 60

@@ -17,20 +17,20 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.escalation import alternatives, climb
+from colmap_affrect.escalation import alternatives, map_and_rematch
 from colmap_affrect.escalation.alternatives import (
     Choice,
     adopt_chosen_models,
-    best_score,
     choose_learned,
     keep_best,
     learned_models_on_record,
     map_learned_matches,
     needs_learned_models,
-    present_score,
+    num_right_poses,
+    num_right_poses_now,
+    num_right_poses_of_best,
     remove_alternatives,
     restore_best,
-    score,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
 from colmap_affrect.escalation.set_state import SetState
@@ -183,7 +183,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
         (2.4, 1.4)
     )
     assert learned_models.is_chosen
-    assert present_score(context) == learned_models.score
+    assert num_right_poses_now(context) == learned_models.score
     assert (
         context.matches.state.modelled == context.matches.state.listed
     )  # are gone on from
@@ -250,11 +250,11 @@ def test_learned_models_that_are_no_better_change_nothing(
 def test_score_counts_poses_that_are_expected_to_be_right() -> None:
     pair = replace(UNSURE, probabilities={"a": 0.9, "b": 0.9})
     three = replace(UNSURE, probabilities={"a": 0.9, "b": 0.9, "c": 0.9})
-    assert score([]) == 0.0
-    assert score([pair]) == pytest.approx(0.8)
-    assert score([three]) == pytest.approx(1.7)
-    assert score([pair, pair]) < score([three])
-    assert score([replace(UNSURE, probabilities={"a": 0.2, "b": 0.2})]) == 0.0
+    assert num_right_poses([]) == 0.0
+    assert num_right_poses([pair]) == pytest.approx(0.8)
+    assert num_right_poses([three]) == pytest.approx(1.7)
+    assert num_right_poses([pair, pair]) < num_right_poses([three])
+    assert num_right_poses([replace(UNSURE, probabilities={"a": 0.2, "b": 0.2})]) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -283,7 +283,7 @@ def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
             escalation.matches.write([none])
     escalation.write()
     map_images(context, mapper)
-    assert present_score(context) < best_score(context)
+    assert num_right_poses_now(context) < num_right_poses_of_best(context)
     return escalation
 
 
@@ -324,7 +324,7 @@ def test_best_models_and_their_matches_come_back(
     )  # nothing is mapped anew
     assert not restore_best(escalation)
     remove_alternatives(context)
-    assert best_score(context) == 0.0
+    assert num_right_poses_of_best(context) == 0.0
     assert not workspace.best.exists()
 
 
@@ -430,7 +430,7 @@ def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
 
 
 @pytest.mark.long
-def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
+def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
     photos: Path,
     recipe: Recipe,
     mapper: Mapper,
@@ -447,14 +447,14 @@ def test_climb_with_learned_matches_ends_and_does_nothing_when_run_again(
     workspace = verified(photos, tmp_path / "out", recipe.name)
     context = Context(workspace)
     with workspace.locked():
-        reports = climb.climb(context, mapper, recipe)
+        reports = map_and_rematch.map_and_rematch(context, mapper, recipe)
         assert reports[-1].num_done == len(escalation_of(context).state.pairs)
         learned_models = learned_models_on_record(context)
         assert learned_models
         assert learned_models.score > 1.0
         before = hdf5_content(workspace.matches), database_content(workspace.database)
         model = (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns
-        again = climb.climb(context, mapper, recipe)
+        again = map_and_rematch.map_and_rematch(context, mapper, recipe)
     assert {report.num_done for report in again} == {0}
     assert (
         hdf5_content(workspace.matches),
@@ -478,14 +478,14 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
     monkeypatch.setattr(SetState, "weights", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
-    climb.climb(whole, mapper, recipe)
+    map_and_rematch.map_and_rematch(whole, mapper, recipe)
     with monkeypatch.context() as patch:
         patch.setattr(Escalation, "write", interrupted_at_third_call())
         with pytest.raises(KeyboardInterrupt):
-            climb.climb(killed, mapper, recipe)
+            map_and_rematch.map_and_rematch(killed, mapper, recipe)
     learned_models = read_summaries(killed.workspace.learned)
     monkeypatch.setattr(alternatives, "map_images", None)
-    climb.climb(killed, mapper, recipe)
+    map_and_rematch.map_and_rematch(killed, mapper, recipe)
     for context in (whole, killed):
         assert levels(context) == {1}
         assert read_summaries(context.workspace.sparse) == learned_models
@@ -512,7 +512,7 @@ def test_models_of_learned_matches_that_were_removed_are_made_again(
     assert learned_models
     remove_alternatives(context)
     assert needs_learned_models(context) == (
-        learned_models.score > present_score(context)
+        learned_models.score > num_right_poses_now(context)
     )
     shutil.rmtree(context.workspace.sparse)
     assert not choose_learned(escalation_of(context), at_once=False)

@@ -26,8 +26,9 @@ from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import MatchStore
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context, Resources

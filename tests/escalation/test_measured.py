@@ -13,9 +13,10 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import Step
 from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.project.match_state import Worth
+from colmap_affrect.project.match_store import PairMatches
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stores import PairMatches, Worth
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.session.context import Context

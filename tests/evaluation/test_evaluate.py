@@ -190,7 +190,7 @@ def test_escalation_stops_where_it_suffices_and_most_verified_inliers_count(
 @pytest.mark.parametrize(("protocol", "options", "message"), [
     ("evd", EvaluateOptions(recipes=["sift"]), "sift is COLMAP's and no recipe"),
     ("evd", EvaluateOptions(max_num_keypoints=0), "--max-num-keypoints 0: must be at least 1"),
-    ("megadepth", EvaluateOptions(), "unknown protocol 'megadepth': known are evd, svp"),
+    ("megadepth", EvaluateOptions(), "unknown protocol 'megadepth'; give evd or svp"),
 ])  # fmt: skip
 def test_bad_options(
     protocol: str, options: Any, message: str, dataset: Path, tmp_path: Path

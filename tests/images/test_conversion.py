@@ -18,6 +18,7 @@ from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images import conversion, reading
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
+from colmap_affrect.project.image_failures import unusable
 
 FOCAL_LENGTH = 0x920A
 EQUIVALENT = 0xA405
@@ -177,12 +178,12 @@ def test_of_a_damaged_page_no_other_page_is_left(
     def as_png(path: Path, data: object, numbers: list[int]) -> Iterator[bytes]:
         for number, content in enumerate(usual(path, data, numbers)):
             if number:
-                raise ImageError("damaged")
+                raise unusable("no_image", path)
             yield content
 
     monkeypatch.setattr(conversion, "_as_png", as_png)
     report = convert_images(scans, tmp_path / "photos")
-    assert report.failures["d.tif"] == "damaged"
+    assert "not a readable image" in report.failures["d.tif"]
     assert not list((tmp_path / "photos").glob("d.tif*"))
 
 

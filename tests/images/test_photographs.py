@@ -28,8 +28,8 @@ from colmap_affrect.images.photographs import (
     photograph_files,
 )
 from colmap_affrect.images.reading import read_mask, read_photograph, shrink_mask
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
-from colmap_affrect.project.stores import FeatureStore
 
 
 def diagonal_mask(size: tuple[int, int] = IMAGE_SIZE) -> Mask:

@@ -17,7 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.interop.hdf5 import import_h5
-from colmap_affrect.project.stores import MatchStore
+from colmap_affrect.project.match_store import MatchStore
 
 PAIR = ("a.png", "sub/b c.png")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +14,13 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.doctor import diagnose
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import (
+    AffrectError,
+    Option,
+    OptionError,
+    with_arguments,
+    with_flags,
+)
 from colmap_affrect.interop.align import Reference, align
 from colmap_affrect.interop.export import export
 from colmap_affrect.interop.hdf5 import export_h5, import_h5
@@ -64,12 +71,20 @@ def test_options_take_both_kinds_of_paths() -> None:
 def test_errors_of_functions_name_arguments(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(AffrectError, "names_flags", False)
+    monkeypatch.setattr(
+        AffrectError, "__str__", lambda error: with_arguments(error.words)
+    )
     with pytest.raises(OptionError, match=r"^image_path \S+none: no such folder$"):
         export(tmp_path, tmp_path / "out", ["ply"], image_path=tmp_path / "none")
-    assert str(
-        AffrectError("--mask-path x: use 'colmap-affrect run --set a=1' or --extend")
-    ) == ("masks.path x: use 'colmap-affrect run --set a=1' or extend")
+    error = AffrectError(
+        "has no mask",
+        where=Option("mask-path", "x"),
+        advice=("use 'colmap-affrect run --set a=1' or ", Option("extend")),
+    )
+    says = "has no mask; use 'colmap-affrect run --set a=1' or"
+    assert str(error) == f"masks.path x: {says} extend"
+    assert with_flags(error.words) == f"--mask-path x: {says} --extend"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
     with pytest.raises(
         OptionError, match=r"call extract_features first, or move this folder"
     ):

@@ -17,7 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, StoreError
 from colmap_affrect.images.reading import read_gray
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 
@@ -172,7 +172,7 @@ def test_a_database_of_another_program_and_other_photographs_are_refused(
     before = keypoints(sift)
     extract = colmap_affrect.extract_features
     with pytest.raises(
-        DatabaseError, match=r"has other features of a\.png.*from_database"
+        DatabaseError, match=r"has other features of a\.png.*--from-database"
     ):
         extract(sift, photos)
     with pytest.raises(OptionError, match="leave out camera mode"):

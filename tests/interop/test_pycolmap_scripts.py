@@ -239,9 +239,9 @@ def test_cancelled_token_stops_and_what_is_done_is_kept(
     class Cancelling(Progress):
         """Cancels after the first image."""
 
-        def stage(self, name: str, total: int, unit: str) -> Any:
+        def stage(self, name: str, total: int, unit: str, part: str = "") -> Any:
             token.cancel()
-            return super().stage(name, total, unit)
+            return super().stage(name, total, unit, part)
 
     path = tmp_path / "a.db"
     token = pycolmap.CancellationToken()

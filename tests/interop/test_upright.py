@@ -18,7 +18,7 @@ from colmap_affrect.geometry.lines import FOCALS, SHIFTS, LineLikelihood, Lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.interop.align import align
 from colmap_affrect.interop.export import export
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.scene import read_view
 

@@ -127,8 +127,10 @@ class KillsOneWorker(Progress):
         self.lost_tasks: Sequence[str] = ()
 
     @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        del name, total, unit
+    def stage(
+        self, name: str, total: int, unit: str, part: str = ""
+    ) -> Iterator[Advance]:
+        del name, total, unit, part
         yield self._advance
 
     def _advance(self, count: int) -> None:

@@ -14,8 +14,8 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry import lines as line_cameras
 from colmap_affrect.geometry.lines import FOCALS, SHIFTS, LineLikelihood, Lines
 from colmap_affrect.geometry.segments import Segments
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.line_report import LineReport, line_report
-from colmap_affrect.project.stores import FeatureStore
 
 LINE_DATASETS = {
     "line_segments",

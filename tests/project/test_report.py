@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from colmap_affrect.project.camera_notes import merge_shared_cameras
+from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
     Advice,
@@ -38,7 +39,11 @@ REPORT = ReconstructionReport(
     num_pairs=10,
     stages=(
         StageReport(
-            "extract", 1.25, 3, 1, {"broken.png": "broken.png: not a readable image"}
+            "extract",
+            1.25,
+            3,
+            1,
+            {"broken.png": ImageFailure("no_image", "broken.png")},
         ),
         StageReport("map", 0.5, 2),
     ),

@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
-from colmap_affrect.project.stores import (
-    FeatureStore,
+from colmap_affrect.project.match_store import (
     Learned,
     MatchStore,
     PairMatches,

@@ -160,7 +160,7 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"SQLite format 3\0 or so")
     with pytest.raises(
-        StoreError, match="was not made here; it is left as it is"
+        StoreError, match="was not made here, and is left as it is"
     ) as error:
         workspace.record_options("extract", OPTIONS, overwrite=overwrite)
     assert str(workspace.path / name.split("/")[0]) in str(error.value)

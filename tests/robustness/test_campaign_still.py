@@ -19,7 +19,8 @@ from results import hdf5_content
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap.model_files import read_poses
-from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.stationary import StationaryFilter
 

@@ -22,7 +22,7 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.errors import StoreError
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.interop.pycolmap_api import extract_features
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import extract as extract_stage
 
@@ -304,7 +304,9 @@ def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("step", ["MatchStore.remove", "FeatureStore.remove"])
+@pytest.mark.parametrize(
+    "step", ["match_store.MatchStore.remove", "feature_store.FeatureStore.remove"]
+)
 def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
     tmp_path: Path, stage: Stage, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
@@ -314,7 +316,7 @@ def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
 
     with monkeypatch.context() as patch:
         patch.setattr(
-            f"colmap_affrect.project.stores.{step}", Mock(side_effect=KeyboardInterrupt)
+            f"colmap_affrect.project.{step}", Mock(side_effect=KeyboardInterrupt)
         )
         with pytest.raises(KeyboardInterrupt):  # of which the process makes one line
             stage("extract")

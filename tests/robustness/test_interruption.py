@@ -35,7 +35,7 @@ from results import differences, hdf5_content, results, tree
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.atomic_files import FileTransaction, journal_of
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 pytestmark = pytest.mark.long

@@ -14,7 +14,7 @@ from results import tree
 from small_scene import write_photographs
 
 import colmap_affrect
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.feature_store import FeatureStore
 
 PACKAGE = Path(colmap_affrect.__file__).parent
 

@@ -16,7 +16,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import num_matched_pairs, open_database
 from colmap_affrect.pairs.lists import exhaustive_pairs
-from colmap_affrect.project.stores import MatchStore, PairMatches
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.session import database_export
 
 NAMES = [f"{index}.png" for index in range(6)]

@@ -19,8 +19,9 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers.lightglue import LightGlueOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.record import file_sha256
-from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.session.context import Context, Resources

@@ -24,9 +24,9 @@ from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 from colmap_affrect.session.context import Context, Inputs, Resources

@@ -29,6 +29,8 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import pair_key
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import (
     Bridge,
@@ -36,7 +38,6 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
 )
-from colmap_affrect.project.stores import FeatureStore, pair_key
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import advice as advice_module
 from colmap_affrect.report.advice import advice
@@ -262,7 +263,7 @@ def test_advice_is_about_what_is_wrong(
     assert "show no depth" in copies.why
     monkeypatch.setattr(Workspace, "recipe", lambda _: "default")
     monkeypatch.setattr(
-        Resources, "how_to_complete", lambda *_: "pip install it, or fetch it"
+        Resources, "commands_to_complete", lambda *_: ["pip install it", "fetch it"]
     )
     assert (
         advice(context, [lost], [model], 0)[0].command == f"pip install it && {again}"
@@ -291,7 +292,7 @@ def test_idle_run_looks_at_no_header(
     copy: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
-    monkeypatch.setattr("colmap_affrect.project.stores.MatchStore.has", None)
+    monkeypatch.setattr("colmap_affrect.project.match_store.MatchStore.has", None)
     run(photos, copy.path, OPTIONS)
 
 

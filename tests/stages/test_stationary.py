@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.stage_warnings import StageWarning
-from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 from colmap_affrect.stages.stationary import StationaryFilter
 
 SIZE = (960, 640)

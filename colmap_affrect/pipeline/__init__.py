@@ -2,8 +2,7 @@
 
 import math
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack, get_args
@@ -12,9 +11,9 @@ from colmap_affrect.colmap.by_hand import ByHand, Marks, SizeOf
 from colmap_affrect.colmap.database import fill_descriptors
 from colmap_affrect.colmap.database_copy import read_names, read_sizes, schema_version
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.errors import ImageError, OptionError
-from colmap_affrect.escalation.climb import climb
+from colmap_affrect.errors import ImageError, Option, OptionError
 from colmap_affrect.escalation.escalate import escalate
+from colmap_affrect.escalation.map_and_rematch import map_and_rematch
 from colmap_affrect.escalation.policy import forecast_of
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
@@ -26,7 +25,6 @@ from colmap_affrect.mappers.existing import (
     existing_names,
     read_to_extend,
 )
-from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
@@ -38,9 +36,10 @@ from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import Recipe
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.report.run_results import MappingResult, write_results
-from colmap_affrect.session.context import Context, Resources
+from colmap_affrect.session.context import Context, Inputs, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.foreign import ForeignDatabase, import_and_verify
@@ -92,7 +91,7 @@ def run(
     options = RunOptions.with_keywords(options, keywords, hint=hint)
     require_bools(overwrite=overwrite, page=page)
     context = replace(
-        _context(output_path, progress, options.resources, executor, options.by_hand),
+        context_of(output_path, progress, options.resources, executor, options.by_hand),
         deadline_s=time.monotonic() + 60 * options.max_minutes,
         effort=options.effort,
         command=options.command,
@@ -114,27 +113,15 @@ def _run(
     workspace = context.workspace
     mapper = MAPPERS.make(options.mapper_options())
     inputs = options.inputs(image_path)
-    names = inputs.names()  # refuses what cannot be read before anything is made
-    inputs.check()
     _check_extension(
         options.extend, mapper, output_path=workspace.path, overwrite=overwrite
     )
-    _check_by_hand(
-        options.by_hand,
-        names,
-        mapper,
-        size_of=lambda name: header_size(image_path / name),
-    )
+    names = _checked_names(inputs, options, mapper)
     num_pairs = _num_pairs(names, options=options.pairs, image_path=image_path)
     usable = options.resources.usable_levels(recipe.extraction)
     forecast = forecast_of(recipe.levels, usable, len(names), num_pairs)
     context = replace(context, progress=replace(context.progress, forecast=forecast))
-    if options.extend:
-        existing_names(options.extend.model_path, names)
-    recipe.extraction.check_depth()
-    weights_path = options.resources.weights_path
-    resolve(recipe.required_weights, weights_path, progress=context.progress)
-    load_matchers(context, recipe.extraction, options=recipe.matching)
+    _prepare_parts(context, recipe)
     later = options.later_stages()
     if overwrite or not workspace.features.exists():
         recipe.matching.load_meanwhile(num_pairs)
@@ -153,7 +140,7 @@ def _run(
                 guide(context, recipe.guided),
             ]
         else:
-            reports += climb(context, mapper, recipe)
+            reports += map_and_rematch(context, mapper, recipe)
         if options.database_descriptors:
             fill_descriptors(workspace.database, context.features)
         return map_and_report(
@@ -161,15 +148,39 @@ def _run(
         )
 
 
+def _checked_names(inputs: Inputs, options: RunOptions, mapper: Mapper) -> list[str]:
+    """Return the names of the photographs, after all that is said of them has been checked."""
+    names = inputs.names()
+    inputs.check()
+    folder = Path(inputs.image_path)
+
+    def size_of(name: str) -> tuple[int, int] | None:
+        return header_size(folder / name)
+
+    _check_by_hand(options.by_hand, names, mapper, size_of)
+    if options.extend:
+        existing_names(options.extend.model_path, names)
+    return names
+
+
+def _prepare_parts(context: Context, recipe: Recipe) -> None:
+    """Find, or download, whatever the parts of a recipe need, before anything is computed."""
+    recipe.extraction.check_depth()
+    weights_path = context.resources.weights_path
+    resolve(recipe.required_weights, weights_path, progress=context.progress)
+    load_matchers(context, recipe.extraction, options=recipe.matching)
+
+
 def _check_by_hand(
     by_hand: ByHand, names: Collection[str], mapper: Mapper, size_of: SizeOf
 ) -> Marks:
-    marks = by_hand.marks(
-        names, size_of
-    )  # refuses what names other photographs, or lies outside
+    # Refuses marks that name other photographs, or lie outside of theirs
+    marks = by_hand.marks(names, size_of)
     if by_hand.tie_points_path and mapper.options.name != MAPPERS.default:
         raise OptionError(
-            f"--tie-points: the {mapper.options.name} mapper takes none; use --mapper sparse"
+            f"the {mapper.options.name} mapper takes none",
+            where=Option("tie-points"),
+            advice=("use ", Option("mapper"), " sparse"),
         )
     return marks
 
@@ -182,7 +193,9 @@ def _check_extension(
         return
     if not mapper.options.can_extend:
         raise OptionError(
-            f"--extend: the {mapper.options.name} mapper cannot; use --mapper sparse"
+            f"the {mapper.options.name} mapper cannot",
+            where=Option("extend"),
+            advice=("use ", Option("mapper"), " sparse"),
         )
     if overwrite:
         extend.refuse_discarding(output_path)
@@ -197,35 +210,7 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
     return count if is_all else min(count, len(names) * options.num_neighbors)
 
 
-# One stage after the other, each from what the stages before have left in the output folder.
-
-
-@contextmanager
-def one_stage(
-    name: str, context: Context, *, overwrite: bool = False
-) -> Iterator[Context]:
-    """Lock the folder of a context for one stage, and bring its database up to date before.
-
-    Args:
-        name: of the stage.
-        context: of the folder.
-        overwrite: the stage discards what is there.
-    """
-    is_first = name == "extract"
-    with (
-        context.progress.never_silent(),
-        context.workspace.locked(),
-        mend_and_seal(
-            context,
-            follows=not is_first,
-            maps=name == "map",
-            discards=is_first and overwrite,
-        ),
-    ):
-        yield context
-
-
-def _context(
+def context_of(
     output_path: PathLike,
     progress: GivenProgress,
     resources: Resources | Mapping[str, Any] | None = None,
@@ -236,11 +221,15 @@ def _context(
     path = as_path(output_path, "output_path")
     if not (executor is None or callable(getattr(executor, "map", None))):
         raise OptionError(
-            f"executor={executor!r}: has no method 'map'; give an Executor"
+            "has no method 'map'",
+            where=f"executor={executor!r}",
+            advice="give an Executor",
         )
     if path.is_file():
         wanted = "give the output folder of a run; map_database and verify_matches take databases"
-        raise OptionError(f"output_path={str(path)!r}: is a file; {wanted}")
+        raise OptionError(
+            "is a file", where=f"output_path={str(path)!r}", advice=wanted
+        )
     return Context(
         workspace=Workspace(path),
         resources=Resources.given(resources, "resources"),
@@ -248,150 +237,6 @@ def _context(
         progress=Progress.given(progress),
         by_hand=ByHand.given(by_hand, "by_hand"),
     )
-
-
-@takes_fields_of(RunOptions)
-def extract(
-    image_path: PathLike,
-    output_path: PathLike,
-    options: RunOptions | None = None,
-    *,
-    executor: Executor | None = None,
-    overwrite: bool = False,
-    progress: GivenProgress = None,
-    **keywords: Unpack[RunKeywords],
-) -> StageReport:
-    """Extract features into ``features.h5``, cameras and keypoints into ``database.db``.
-
-    Args:
-        image_path: folder of the photographs, searched with its sub-folders.
-        output_path: folder for all results, made if missing.
-        options: see :func:`run`; those of later stages are kept for these.
-        executor: see :func:`run`.
-        overwrite: discard results that are there.
-        progress: see :func:`run`.
-        keywords: see :func:`run`.
-
-    Returns:
-        How many images were extracted, and why others were not.
-    """
-    image_path = as_path(image_path, "image_path")
-    options = RunOptions.with_keywords(options, keywords)
-    require_bools(overwrite=overwrite)
-    inputs = options.inputs(image_path)
-    later = options.later_stages()
-    context = _context(output_path, progress, options.resources, executor)
-    with one_stage("extract", context, overwrite=overwrite):
-        report = extract_features(
-            context, inputs, options.recipe, later=later, overwrite=overwrite
-        )
-        if options.database_descriptors:
-            fill_descriptors(context.workspace.database, context.features)
-    return report
-
-
-def choose_pairs(
-    output_path: PathLike,
-    pairs: PairOptions | Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-    progress: GivenProgress = None,
-) -> StageReport:
-    """Write ``pairs.txt``, which says which images are matched.
-
-    Args:
-        output_path: folder that :func:`extract` was given.
-        pairs: which; None: as :func:`extract` was told, else all.
-        overwrite: discard the results of this and later stages.
-        progress: see :func:`run`.
-    """
-    require_bools(overwrite=overwrite)
-    chosen = None if pairs is None else PairOptions.given(pairs, "pairs")
-    with one_stage("pairs", _context(output_path, progress)) as context:
-        return list_pairs(context, chosen, overwrite=overwrite)
-
-
-def match(
-    output_path: PathLike,
-    matching: MatcherOptions | Mapping[str, Any] | str | None = None,
-    *,
-    resources: Resources | Mapping[str, Any] | None = None,
-    executor: Executor | None = None,
-    overwrite: bool = False,
-    progress: GivenProgress = None,
-) -> StageReport:
-    """Match the pairs of ``pairs.txt``, into ``matches.h5`` and ``database.db``.
-
-    Args:
-        output_path: folder that :func:`choose_pairs` was given.
-        matching: the matcher and its options, or its name; None: that of the recipe.
-        resources: weights and device of networks.
-        executor: see :func:`run`.
-        overwrite: discard the results of this and later stages.
-        progress: see :func:`run`.
-    """
-    require_bools(overwrite=overwrite)
-    matcher = None if matching is None else MATCHERS.options(matching, "matching")
-    context = _context(output_path, progress, resources, executor)
-    with one_stage("match", context):
-        return match_pairs(context, options=matcher, overwrite=overwrite)
-
-
-def verify(
-    output_path: PathLike,
-    verification: VerificationOptions | Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
-    progress: GivenProgress = None,
-) -> StageReport:
-    """Estimate the two-view geometries of the matched pairs, into ``database.db``.
-
-    Args:
-        output_path: folder that :func:`match` was given.
-        verification: its options; None: as :func:`extract` was told.
-        overwrite: discard the results of this and later stages.
-        progress: see :func:`run`.
-    """
-    require_bools(overwrite=overwrite)
-    chosen = None
-    if verification is not None:
-        chosen = VerificationOptions.given(verification, "verification")
-    with one_stage("verify", _context(output_path, progress)) as context:
-        return verify_pairs(context, chosen, overwrite=overwrite)
-
-
-def map_images(
-    output_path: PathLike,
-    mapping: MapperOptions | Mapping[str, Any] | str | None = None,
-    *,
-    extend: Extension | PathLike | None = None,
-    by_hand: ByHand | Mapping[str, Any] | None = None,
-    overwrite: bool = False,
-    page: bool = True,
-    progress: GivenProgress = None,
-) -> RunReport:
-    """Make models of the verified pairs, in ``sparse/0``, ``sparse/1`` and so on.
-
-    Args:
-        output_path: folder that :func:`verify` was given.
-        mapping: the mapper and its options, or its name; None: as :func:`extract` was told.
-        extend: a model that the images are registered into, or its folder.
-        by_hand: tie points, wrong pairs, photographs to leave out.
-        overwrite: discard the models that are there.
-        page: also write ``report.html``.
-        progress: see :func:`run`.
-
-    Returns:
-        The report that is also written to ``report.json``, with the models.
-    """
-    require_bools(overwrite=overwrite, page=page)
-    extension = as_extension(extend)
-    chosen = None if mapping is None else _mapper_of(mapping)
-    with one_stage("map", _context(output_path, progress, by_hand=by_hand)) as context:
-        mapper = chosen or MAPPERS.make(context.mapping)
-        return map_and_report(
-            context, mapper, extend=extension, overwrite=overwrite, page=page
-        )
 
 
 def map_database(  # noqa: PLR0913 (all but two are keywords)
@@ -444,8 +289,8 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
         match_type=match_type,
         match_list_path=as_path_or_none(match_list_path, "match_list_path"),
     )
-    context = _context(output_path, progress, by_hand=by_hand)
-    mapper = _mapper_of(mapping)
+    context = context_of(output_path, progress, by_hand=by_hand)
+    mapper = mapper_of(mapping)
     chosen = VerificationOptions.given(verification, "verification")
     extension = as_extension(extend)
     _check_foreign(context, foreign, mapper, extend=extension, overwrite=overwrite)
@@ -462,7 +307,8 @@ def map_database(  # noqa: PLR0913 (all but two are keywords)
         )
 
 
-def _mapper_of(mapping: MapperOptions | Mapping[str, Any] | str | None) -> Mapper:
+def mapper_of(mapping: MapperOptions | Mapping[str, Any] | str | None) -> Mapper:
+    """Return the mapper that is given by its options or name; None: the usual one."""
     return MAPPERS.make(MAPPERS.options(mapping or MAPPERS.default, "mapping"))
 
 
@@ -476,7 +322,9 @@ def _check_foreign(
 ) -> None:
     """Refuse what cannot be mapped, or not so, before anything is made."""
     if foreign.match_type not in get_args(MatchType):
-        raise OptionError(f"match_type={foreign.match_type!r}: give 'raw' or 'inliers'")
+        raise OptionError(
+            "give 'raw' or 'inliers'", where=f"match_type={foreign.match_type!r}"
+        )
     schema_version(foreign.path)
     _check_extension(
         extend, mapper, output_path=context.workspace.path, overwrite=overwrite
@@ -550,6 +398,8 @@ def _names_and_gone(
     if gone and not may_be_gone:
         path = context.inputs.image_path
         raise ImageError(
-            f"{path}: {gone[0]} has features, and is gone; run extract again"
+            f"{gone[0]} has features, and is gone",
+            where=path,
+            advice="run extract again",
         )
     return sorted({*names, *gone}), gone

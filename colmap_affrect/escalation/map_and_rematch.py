@@ -1,4 +1,4 @@
-"""Climb: map, match again what lost and doubtful photographs need, and map on, until nothing helps.
+"""Map, match again what lost and doubtful photographs need, and map on, until nothing helps.
 
 The first model says what is needed: where it is sure of all photographs, nothing more is done.
 Later models begin with those before. Models of learned matches are looked at as well, and the
@@ -29,7 +29,9 @@ from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
 
 
-def climb(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
+def map_and_rematch(
+    context: Context, mapper: Mapper, recipe: Recipe
+) -> list[StageReport]:
     """Map, and match again, until nothing helps; ``sparse/`` has the best models found.
 
     A killed run goes on: once pairs are matched again, the first model is not made anew.

@@ -1,52 +1,34 @@
-"""Features and matches of a run in HDF5, in hloc's layout (docs/formats.md).
+"""Matches of a run in HDF5, in hloc's layout (docs/formats.md).
 
-Features of the levels of escalation follow each other in the order in which they were asked for:
-those of ``levels[k]`` end at ``level_ends[k]``. Descriptors of several sizes are filled up with
-zeros, which change no distance. Matches have the attributes ``level``, whose features were matched
-together with those of level 0, and ``tried``, with a bit for each level that was tried. Beside
-them a pair may have learned matches that are not in use (:class:`Learned`), and pairs that use
-learned ones have the attribute ``measured_worth``: what the best of measured frames are worth.
-Files are opened for one image or one batch of pairs and closed again; what is written in between
-appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
+Matches have the attributes ``level``, whose features were matched together with those of level 0,
+and ``tried``, with a bit for each level that was tried. Beside them a pair may have learned matches
+that are not in use (:class:`Learned`), and pairs that use learned ones have the attribute
+``measured_worth``: what the best of measured frames are worth. The file is opened for one batch of
+pairs and closed again; what is written in between appears as a whole
+(:mod:`colmap_affrect.project.atomic_files`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
-from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.lines import Lines
+from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.project.group_store import (
     GroupStore,
     entries_of,
     has_entry,
     read_checked,
 )
-from colmap_affrect.project.line_report import (
-    LINE_DATASETS,
-    line_datasets,
-    lines_from_datasets,
-)
 from colmap_affrect.project.match_state import STATE_JSON, MatchState, Names, Worth
-from colmap_affrect.project.record import Content, stamp_of
 
 MAX_INT16 = 32767  # format
-NOT_KNOWN = Content()
 PAIRS_PER_WRITE = 64  # a run that is ended loses at most as many; resource
 STATE = "state"  # attribute of the file of matches
-
-Entries = dict[str, tuple[Content, int, tuple[int, int]]]
-"""By image: what it was extracted from, the number of its features, and (width, height) in px."""
 
 
 @dataclass(frozen=True)
@@ -68,242 +50,6 @@ class Learned:
 
     matches: PairMatches
     worth: Worth
-
-
-@lru_cache(maxsize=8)
-def _entries_of(path: Path, _: str) -> Entries:
-    """Go through a file, which takes long, unless that was done when its stamp was the same."""
-    found: Entries = {}
-    with FeatureStore(path)._open("r") as file:
-        for name, group in entries_of(file):
-            width, height = read_checked(group, "image_size").tolist()
-            found[name] = _content(group), len(group["keypoints"]), (width, height)
-    return dict(sorted(found.items()))
-
-
-def _content(group: h5py.Group) -> Content:
-    return Content(
-        str(group.attrs.get("content", "")), str(group.attrs.get("stamp", ""))
-    )
-
-
-def _level_ends(group: h5py.Group) -> dict[int, int]:
-    levels = read_checked(group, "levels").tolist()
-    return dict(zip(levels, read_checked(group, "level_ends").tolist(), strict=True))
-
-
-def _line_datasets(group: h5py.Group) -> dict[str, NDArray[Any]]:
-    return {key: read_checked(group, key) for key in LINE_DATASETS if key in group}
-
-
-def frame_datasets(lafs: Floats) -> dict[str, Singles]:
-    """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
-    stored = lafs.astype(np.float32)
-    shapes = stored[:, :, :2].astype(np.float64)
-    scales = np.sqrt(np.abs(np.linalg.det(shapes))) / MEASUREMENT_SIGMAS
-    oris = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0])).astype(np.float32)
-    return {"lafs": stored, "scales": scales.astype(np.float32), "oris": oris}
-
-
-class FeatureStore(GroupStore):
-    """Local features by image name."""
-
-    format = "colmap_affrect/features"
-    stage = "extract"
-
-    def _entries(self) -> Entries:
-        return (
-            _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
-        )
-
-    @contextmanager
-    def _open(self, mode: str) -> Iterator[h5py.File]:
-        if mode != "r":
-            _entries_of.cache_clear()  # it may change again within one tick of the clock
-        with super()._open(mode) as file:
-            yield file
-
-    def names(self) -> list[str]:
-        """Return the sorted names of the images."""
-        return sorted(self._entries())
-
-    def write(
-        self,
-        name: str,
-        features: LocalFeatures,
-        image_size: tuple[int, int],
-        content: Content = NOT_KNOWN,
-        lines: Lines | None = None,
-    ) -> None:
-        """Write the features of one image.
-
-        Args:
-            name: of the image.
-            features: of the image.
-            image_size: (width, height) in px.
-            content: what the files hold that they are from.
-            lines: its straight lines; None where they were not measured.
-        """
-        with self._open("a") as file:
-            self._write_features(
-                file,
-                name,
-                features,
-                image_size,
-                level_ends={0: len(features)},
-                content=content,
-                more={} if lines is None else line_datasets(lines),
-            )
-
-    def contents(self) -> dict[str, Content]:
-        """Return for each image what the files hold that it was extracted from."""
-        return {name: content for name, (content, *_) in self._entries().items()}
-
-    def record_contents(self, contents: Mapping[str, Content]) -> None:
-        """Put on record what images were extracted from."""
-        with self._open("a") as file:
-            for name, content in contents.items():
-                file[name].attrs.update(content=content.digest, stamp=content.stamp)
-
-    def remove(self, names: Iterable[str]) -> None:
-        """Remove the features of images."""
-        with self._open("a") as file:
-            for name in names:
-                del file[name]
-
-    def extend(self, name: str, features: LocalFeatures, level: int) -> None:
-        """Add the features of another level; what is there keeps its indices.
-
-        Args:
-            name: of the image.
-            features: of this level alone, in px of the stored image.
-            level: number of the level in the recipe.
-        """
-        with self._open("a") as file:
-            group = self._group(file, name)
-            known = self._features(group)
-            first_id = int(known.rectification_ids.max(initial=0))
-            ids = features.rectification_ids
-            added = replace(
-                features, rectification_ids=np.where(ids, ids + first_id, 0)
-            )
-            both = union(of_one_size([known, added]))
-            self._write_features(
-                file,
-                name,
-                features=both,
-                image_size=tuple(read_checked(group, "image_size").tolist()),
-                level_ends={**_level_ends(group), level: len(both)},
-                content=_content(group),
-                more=_line_datasets(group),
-            )
-
-    def _write_features(
-        self,
-        file: h5py.File,
-        name: str,
-        features: LocalFeatures,
-        image_size: tuple[int, int],
-        level_ends: dict[int, int],
-        content: Content,
-        more: Mapping[str, NDArray[Any]],
-    ) -> None:
-        datasets = {
-            "keypoints": features.keypoints.astype(np.float32),
-            "descriptors": features.descriptors.T.astype(np.float16),
-            "scores": features.responses,
-            "image_size": np.asarray(image_size),
-            **frame_datasets(features.lafs),
-            "rectification_ids": features.rectification_ids,
-            "levels": np.asarray(list(level_ends)),
-            "level_ends": np.asarray(list(level_ends.values())),
-            **more,
-        }
-        self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
-
-    def read(self, name: str) -> LocalFeatures:
-        """Read all features of one image; StoreError if they are missing."""
-        with self._open("r") as file:
-            return self._features(self._group(file, name))
-
-    def lines_of(self, names: Iterable[str]) -> dict[str, Lines]:
-        """Return the straight lines of images; files of older versions have none."""
-        found = dict[str, Lines]()
-        if not self.path.exists():
-            return found
-        with self._open("r") as file:
-            for name in names:
-                if has_entry(file, name):
-                    lines = lines_from_datasets(_line_datasets(file[name]))
-                    if lines is not None:
-                        found[name] = lines
-        return found
-
-    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
-        """Return the indices of the features of two levels, each once, rising.
-
-        Args:
-            name: of the image.
-            level: number of a level in the recipe.
-            base: number of another one, or the same.
-
-        Returns:
-            (N,) int64.
-        """
-        ranges = self.level_ranges(name)
-        indices = np.arange(ranges[level].start, ranges[level].stop)
-        if base == level:
-            return indices
-        others = np.arange(ranges[base].start, ranges[base].stop)
-        return np.sort(np.concatenate([others, indices]))
-
-    def _group(self, file: h5py.File, name: str) -> h5py.Group:
-        if not has_entry(file, name):
-            raise StoreError(f"{self.path}: no features of {name}; run extract first")
-        return file[name]
-
-    @staticmethod
-    def _features(group: h5py.Group) -> LocalFeatures:
-        return LocalFeatures(
-            lafs=read_checked(group, "lafs").astype(np.float64),
-            responses=read_checked(group, "scores"),
-            descriptors=np.ascontiguousarray(
-                read_checked(group, "descriptors").T, dtype=np.float32
-            ),
-            rectification_ids=read_checked(group, "rectification_ids"),
-        )
-
-    def level_ranges(self, name: str) -> dict[int, range]:
-        """Return which features are of each level that an image has, in their order."""
-        with self._open("r") as file:
-            ends = _level_ends(self._group(file, name))
-        ranges = dict[int, range]()
-        start = 0
-        for level, end in ends.items():
-            ranges[level] = range(start, end)
-            start = end
-        return ranges
-
-    def num_keypoints(self) -> dict[str, int]:
-        """Return the number of features of each image."""
-        return {name: count for name, (_, count, _) in self._entries().items()}
-
-    def image_size(self, name: str) -> tuple[int, int]:
-        """Return the (width, height) of one image in px."""
-        width, height = self._values(name, "image_size").tolist()
-        return width, height
-
-    def image_sizes(self) -> dict[str, tuple[int, int]]:
-        """Return the (width, height) of each image in px."""
-        return {name: size for name, (*_, size) in self._entries().items()}
-
-    def read_frames(self, name: str) -> Singles:
-        """Read the (N, 2, 3) frames of one image."""
-        return self._values(name, "lafs")
-
-    def _values(self, name: str, dataset: str) -> NDArray[Any]:
-        with self._open("r") as file:
-            return read_checked(self._group(file, name), dataset)
 
 
 def pair_key(name1: str, name2: str) -> str:
@@ -514,7 +260,9 @@ class MatchStore(GroupStore):
                 key = pair_key(name1, name2)
                 if not has_entry(file, key):
                     raise StoreError(
-                        f"{self.path}: no matches of {name1}, {name2}; run match"
+                        f"no matches of {name1}, {name2}",
+                        where=self.path,
+                        advice="run match",
                     )
                 yield _read_matches(file[key], (name1, name2))
 
