@@ -20,11 +20,15 @@ NUM_PLAIN_LINES = 10  # display
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
+LEARNED_COSTS = {"image": 1.0, "pair": 1.75}
+"""Of learned matching, in the same unit: as ``expected_gain.json`` has them, measured there."""
 AFTER_FIRST_MODEL = ("escalate", "pictures")
 """Stages that follow the first model."""
-AFTER_SHARE = 0.6
-"""Of the time until the first model, what follows it: nothing where it is sure of all, up to twice
-as much; measured on sets of 4 to 7 photographs, good for a factor of 2."""
+AFTER_SHARE = 1.0
+"""Of the time until the first model, the most that follows it beside learned matching; the effort
+``normal``, as its definition has it (theory). Nothing follows a model that is sure of all: which
+of both, only it can tell."""
+FACTOR = 2.0  # that a forecast may be off; where it may be more, two are told; display
 GOES_ON_SHARE = 0.5
 """Of the time that mapping has taken already: what it still takes, at least, since hypotheses
 follow the last photograph; measured on the same sets."""
@@ -36,9 +40,10 @@ MIN_NUM_MEASURED = 2
 LONGEST_IN_SECONDS = 90.0  # that a forecast tells in seconds; display
 
 
-# Of silence, until something says that the work goes on (display); where lines stay, as in a log,
+# Of silence, until something says that the work goes on (display): with the start of Python and
+# the second between two looks less than 5; where lines stay, as in a log,
 # twice as long after each of them, up to the longest
-QUIET_S = 5.0
+QUIET_S = 4.0
 LONGEST_QUIET_S = 60.0  # Display
 
 
@@ -47,6 +52,7 @@ class Voice:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.doing = "beginning"
+        self.is_listened_to = False  # something speaks where nothing else does
         self._clock = clock
         self._heard_s = clock()  # when something was shown last
         self._since_s = (
@@ -86,6 +92,9 @@ class Forecast:
         num_images: int,
         num_pairs: int,
         clock: Callable[[], float] = time.monotonic,
+        *,
+        num_learned_pairs: int = 0,
+        goes_on: bool = True,
     ) -> None:
         """Take what is ahead if all images are new.
 
@@ -93,7 +102,14 @@ class Forecast:
             num_images: photographs of the run.
             num_pairs: pairs that will be matched.
             clock: seconds from anywhere on.
+            num_learned_pairs: pairs that learned matching takes if the first model needs it.
+            goes_on: whether anything may follow the first model.
         """
+        self._goes_on = goes_on
+        self._learned_cost = 0.0
+        if num_learned_pairs:
+            self._learned_cost = LEARNED_COSTS["image"] * num_images
+            self._learned_cost += LEARNED_COSTS["pair"] * num_learned_pairs
         self._ahead = {
             "extract": COSTS["extract"] * num_images,
             "match": COSTS["match"] * num_pairs,
@@ -134,6 +150,8 @@ class Forecast:
         if is_after and self._is_first_model:
             self._is_first_model = False
             self._ahead.clear()
+            if total and name != "pictures":
+                self._stage = _RunningStage(self._learned_cost, total, self._clock())
 
     def advance(self, num_done: int) -> None:
         """Take note of how many units of the stage are done."""
@@ -145,30 +163,59 @@ class Forecast:
         self._limit_told_s = self._clock()
 
     def left_s(self) -> float | None:
-        """Return the seconds that are left of the run; None while too little is measured."""
+        """Return the seconds that are left of the run; None while too little is measured.
+
+        Where it is open what follows the first model this is between the least and the most, as
+        many times the one as the other is times it.
+        """
+        ends_s = self.least_and_most_s()
+        return math.sqrt(ends_s[0] * ends_s[1]) if ends_s else None
+
+    def least_and_most_s(self) -> tuple[float, float] | None:
+        """Return the seconds that are left if nothing follows the first model, and if all does."""
         now_s = self._clock()
         here_s = self._stage.left_s(now_s)
+        if here_s is None and self._stage.cost:
+            here_s = self._left_by_cost_s(now_s)
         if here_s is None or now_s - self._run_began_s < MIN_ELAPSED_S:
             return None
         if self._name == "map":
             here_s = max(here_s, self._left_of_map_s(now_s))
         if not self._is_first_model:
             passed_s = now_s - self._limit_told_s
-            return max(here_s, LIKELY_SHARE * self._limit_s - passed_s)
-        left_s = here_s + self._pace(now_s) * sum(self._ahead.values())
-        first_model_s = now_s - self._work_began_s + left_s
-        return left_s + AFTER_SHARE * first_model_s
+            left_s = max(here_s, LIKELY_SHARE * self._limit_s - passed_s)
+            return left_s, left_s
+        pace = self._pace(now_s)
+        least_s = here_s + pace * sum(self._ahead.values())
+        if not self._goes_on:
+            return least_s, least_s
+        after_s = pace * self._learned_cost
+        if not after_s:
+            after_s = AFTER_SHARE * (now_s - self._work_began_s + least_s)
+        return least_s, least_s + after_s
 
     def _left_of_map_s(self, now_s: float) -> float:
         """Return how long mapping takes by what it costs, and by what it has taken."""
         elapsed_s = now_s - self._stage.began_s
-        pace = self._done_s / self._done_cost if self._done_cost else 0.0
-        return max(pace * self._stage.cost - elapsed_s, GOES_ON_SHARE * elapsed_s)
+        return max(self._left_by_cost_s(now_s) or 0.0, GOES_ON_SHARE * elapsed_s)
+
+    def _left_by_cost_s(self, now_s: float) -> float | None:
+        """Return how long the stage takes by its cost; None before the end of another one."""
+        if not self._done_cost:
+            return None
+        elapsed_s = now_s - self._stage.began_s
+        pace = self._done_s / self._done_cost
+        return max(0.0, pace * self._stage.cost - elapsed_s)
 
     def text(self) -> str:
         """Say how long the run still takes; empty while too little is measured."""
-        left_s = self.left_s()
-        return "" if left_s is None else f"about {_duration(left_s)} left in all"
+        ends_s = self.least_and_most_s()
+        if ends_s is None:
+            return ""
+        least_s, most_s = ends_s
+        if most_s <= FACTOR * least_s:
+            return f"about {_duration(math.sqrt(least_s * most_s))} left in all"
+        return f"{_duration(least_s)} to {_duration(most_s)} left in all"
 
     def _pace(self, now_s: float) -> float:
         """Return the seconds of a unit of cost, measured in this stage and those before."""
@@ -372,25 +419,31 @@ class Progress:
         return self.forecast.text()
 
     @contextmanager
-    def never_silent(self, interval_s: float = 1.0) -> Iterator[None]:
-        """Say that the work goes on, for as long as the context lasts and nothing else speaks."""
+    def never_silent(
+        self, doing: str = "beginning", interval_s: float = 1.0
+    ) -> Iterator[None]:
+        """Say that the work goes on, for as long as the context lasts and nothing else speaks.
+
+        Args:
+            doing: what is done, until a stage begins; inside of another such context that one's.
+            interval_s: how often to see whether something was said, seconds.
+        """
         stream = self.stream
-        if stream is None:
+        voice = self.voice
+        if stream is None or voice.is_listened_to:
             yield
             return
         is_over = threading.Event()
         replaces = self.takes_bars
-        longest = 0
-        self.voice.heard(f"{self.title}beginning")
+        voice.heard(f"{self.title}{doing}")
+        voice.is_listened_to = True
 
         def listen() -> None:
-            nonlocal longest
+            """Speak where nothing else does."""
             while not is_over.wait(interval_s):
-                text = self.voice.wanted(stays=not replaces)
+                text = voice.wanted(stays=not replaces)
                 if text and replaces:
-                    longest = max(longest, len(text))
-                    stream.write(f"\r{shown(text).ljust(longest)}")
-                    stream.flush()
+                    _AT_WORK.show(text, stream)
                 elif text:
                     show(text, file=stream)
 
@@ -398,8 +451,37 @@ class Progress:
             with _in_background(listen, is_over):
                 yield
         finally:
-            if longest:
-                stream.write(f"\r{' ' * longest}\r")
+            voice.is_listened_to = False
+            _AT_WORK.wipe()
+
+
+class _ReplacedLine:
+    """The line of a terminal that says what is at work, until something else is printed."""
+
+    def __init__(self) -> None:
+        """Begin with nothing shown."""
+        self._stream: TextIO | None = None
+        self._longest = 0  # characters that were shown and are not wiped
+        self._lock = threading.Lock()
+
+    def show(self, text: str, stream: TextIO) -> None:
+        """Put a text in the place of the one before."""
+        with self._lock:
+            self._stream = stream
+            self._longest = max(self._longest, len(text))
+            stream.write(f"\r{shown(text).ljust(self._longest)}")
+            stream.flush()
+
+    def wipe(self) -> None:
+        """Take away what is shown."""
+        with self._lock:
+            if self._stream and self._longest:
+                self._stream.write(f"\r{' ' * self._longest}\r")
+                self._stream.flush()
+            self._longest = 0
+
+
+_AT_WORK = _ReplacedLine()
 
 
 @contextmanager
@@ -453,6 +535,7 @@ def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
         file: where to; None: standard output.
         end: what follows the text.
     """
+    _AT_WORK.wipe()
     print(shown(str(text)), file=file, end=end)
 
 

@@ -33,6 +33,8 @@ FOREIGN = {
     "--Mapper.tri_ignore_two_view_tracks", "--nthreads", "--nworkers", "--claim",
 }  # fmt: skip
 """Options of other programs that the pages name."""
+MAX_PICTURE_BYTES = 1_200_000
+"""Of docs/pictures, which each clone brings."""
 MAX_WORDS = 1500
 """Of README.md, which is to be read in five minutes."""
 
@@ -164,6 +166,23 @@ def test_links_lead_somewhere(name: str) -> None:
                 for text in headings
             }
             assert anchor in slugs, target
+
+
+def pictures_of(name: str) -> list[Path]:
+    """The pictures that a page shows."""
+    targets = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", TEXTS[name])
+    return [(ROOT / name).parent / target for target in targets]
+
+
+def test_each_page_of_the_documentation_has_a_picture_and_all_are_shown() -> None:
+    shown = set()
+    for name in PAGES:
+        found = pictures_of(name)
+        assert found or not name.startswith("docs/"), name
+        shown |= {path.resolve() for path in found}
+    taken = set((ROOT / "docs" / "pictures").iterdir())
+    assert taken <= shown
+    assert sum(path.stat().st_size for path in taken) < MAX_PICTURE_BYTES
 
 
 def said_by_the_program() -> set[str]:

@@ -10,14 +10,17 @@ from collections.abc import Callable
 import pytest
 
 from colmap_affrect.progress import (
+    _AT_WORK,
     AFTER_SHARE,
     COSTS,
     GOES_ON_SHARE,
+    LEARNED_COSTS,
     NUM_PLAIN_LINES,
     SILENT,
     Forecast,
     Progress,
     Voice,
+    show,
 )
 
 
@@ -98,7 +101,33 @@ def test_what_is_slower_than_usual_is_learned_from_the_stages_before() -> None:
     forecast = Forecast(10, 45, clock)
     found = run_stage(clock, forecast, "extract", 10, 30.0)
     units = 10 + 45 * (COSTS["match"] + COSTS["verify"]) + 12 * COSTS["map"]
-    assert found[-1] == pytest.approx(30.0 * units * (1 + AFTER_SHARE), rel=0.01)
+    least_s = 30.0 * units - clock.now_s
+    most_s = least_s + AFTER_SHARE * 30.0 * units
+    assert found[-1] - clock.now_s == pytest.approx((least_s * most_s) ** 0.5, rel=0.01)
+
+
+def test_learned_matching_has_its_own_cost_and_two_forecasts_are_told() -> None:
+    """Nothing follows a first model that is sure: before it is there, both may come."""
+    clock = Clock()
+    forecast = Forecast(10, 45, clock, num_learned_pairs=45)
+    run_stage(clock, forecast, "extract", 10, 2.0)
+    ends_s = forecast.least_and_most_s()
+    assert ends_s is not None
+    learned_s = 2.0 * (10 * LEARNED_COSTS["image"] + 45 * LEARNED_COSTS["pair"])
+    assert ends_s[1] - ends_s[0] == pytest.approx(learned_s, rel=0.01)
+    assert forecast.text() == "50 s to 4 min left in all"
+    forecast.begin("escalate", 55, "aliked")  # nothing of it is done
+    assert forecast.least_and_most_s() == pytest.approx((learned_s, learned_s))
+
+
+def test_where_nothing_may_follow_the_first_model_one_forecast_is_told() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 45, clock, num_learned_pairs=45, goes_on=False)
+    run_stage(clock, forecast, "extract", 10, 2.0)
+    ends_s = forecast.least_and_most_s()
+    assert ends_s is not None
+    assert ends_s[0] == ends_s[1]
+    assert forecast.text() == "about 50 s left in all"
 
 
 def test_mapping_is_not_at_its_end_with_the_last_photograph() -> None:
@@ -126,9 +155,7 @@ def test_forecasts_are_shown_with_the_stage_once_enough_is_measured() -> None:
             advance(1)
     shown = lines.getvalue().splitlines()
     assert shown[0] == "extract: 2/20 images"
-    assert re.fullmatch(
-        r"extract: 10/20 images, about (\d\d s|\d min) left in all", shown[4]
-    )
+    assert re.fullmatch(r"extract: 10/20 images, 80 s to 3 min left in all", shown[4])
     terminal = Terminal()
     progress = Progress(terminal, forecast=Forecast(20, 190, clock))
     with progress.stage("extract", 20, "images") as advance:
@@ -145,11 +172,11 @@ def test_durations_are_told_as_exactly_as_a_forecast_is(
     seconds: float, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forecast = Forecast(1, 0)
-    monkeypatch.setattr(forecast, "left_s", lambda: seconds)
+    monkeypatch.setattr(forecast, "least_and_most_s", lambda: (seconds, seconds))
     assert forecast.text() == f"about {words} left in all"
 
 
-def test_a_voice_speaks_after_five_seconds_and_seldomer_where_lines_stay() -> None:
+def test_a_voice_speaks_after_four_seconds_and_seldomer_where_lines_stay() -> None:
     now_s = 0.0
     said = []
     voice = Voice(clock=lambda: now_s)
@@ -160,13 +187,13 @@ def test_a_voice_speaks_after_five_seconds_and_seldomer_where_lines_stay() -> No
         if text:
             said.append(text)
     seconds = [int(text.removesuffix(" s").rpartition(" ")[2]) for text in said]
-    assert seconds == [5, 10, 20, 40, 80, 140, 200]
-    assert said[0] == "map: 9/9 images: at work for 5 s"
+    assert seconds == [4, 8, 16, 32, 64, 124, 184]
+    assert said[0] == "map: 9/9 images: at work for 4 s"
     voice.heard("pictures")
-    now_s += 4.0
+    now_s += 3.0
     assert voice.wanted(stays=True) == ""
     now_s += 1.0
-    assert voice.wanted(stays=True) == "pictures: at work for 5 s"
+    assert voice.wanted(stays=True) == "pictures: at work for 4 s"
 
 
 def test_a_voice_counts_seconds_where_a_line_is_replaced() -> None:
@@ -176,13 +203,32 @@ def test_a_voice_counts_seconds_where_a_line_is_replaced() -> None:
     for _ in range(8):
         now_s += 1.0
         said.append(voice.wanted(stays=False))
-    assert said[:4] == [""] * 4
-    assert [text.rpartition(" for ")[2] for text in said[4:]] == [
+    assert said[:3] == [""] * 3
+    assert [text.rpartition(" for ")[2] for text in said[3:]] == [
+        "4 s",
         "5 s",
         "6 s",
         "7 s",
         "8 s",
     ]
+
+
+def test_a_voice_that_speaks_already_is_not_doubled_and_print_takes_its_line_away() -> (
+    None
+):
+    terminal = Terminal()
+    progress = Progress(terminal)
+    with progress.never_silent("export"):
+        assert progress.voice.doing == "export"
+        with progress.never_silent("run"):
+            assert progress.voice.doing == "export"
+        assert progress.voice.is_listened_to
+        _AT_WORK.show("export: at work for 4 s", terminal)
+        show("a line", file=terminal)
+    assert not progress.voice.is_listened_to
+    replaced = "\rexport: at work for 4 s"
+    wiped = f"\r{' ' * 23}\r"
+    assert terminal.getvalue() == f"{replaced}{wiped}a line\n"
 
 
 def test_work_without_stages_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,12 +12,14 @@ from typing import TextIO
 
 from colmap_affrect import __version__, errors
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.progress import Progress
+from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger("colmap_affrect")
+SPEAK_THEMSELVES = ("compare", "serve")
+"""Commands that other processes speak for, or that wait for a person."""
 
 
 def main(
@@ -51,12 +53,16 @@ def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
         *(word for word in given if word != "--overwrite"),
     )
     with _logging(options):
-        with Progress(None if options.quiet else sys.stderr).never_silent():
+        options.progress = SILENT if options.quiet else Progress(sys.stderr)
+        with options.progress.never_silent():
             from colmap_affrect.cli import commands  # not for --help; takes seconds
 
         command = getattr(commands, options.command.replace("-", "_"), commands.stage)
         begin()
-        return command(options) or 0
+        if options.command in SPEAK_THEMSELVES:
+            return command(options) or 0
+        with options.progress.never_silent(options.command):
+            return command(options) or 0
 
 
 def _problem(error: OSError) -> str:

@@ -7,8 +7,8 @@ runs: ``--help`` loads no heavy package.
 import argparse
 import shlex
 import shutil
-import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect import doctor as examination
@@ -48,7 +48,7 @@ from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.pipeline import single_stages
-from colmap_affrect.progress import SILENT, Progress, show
+from colmap_affrect.progress import Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
             executor=executor,
             overwrite=bool(options.overwrite),
             page=options.page,
-            progress=given.progress(options),
+            progress=options.progress,
         )
     _print_reconstruction(report, options)
 
@@ -140,7 +140,7 @@ def map(options: argparse.Namespace) -> None:
             verification=given.verification(options),
             extend=extend,
             by_hand=given.by_hand(options),
-            progress=given.progress(options),
+            progress=options.progress,
             **how,
         )
     else:
@@ -162,7 +162,7 @@ def compare(options: argparse.Namespace) -> None:
             **given.inputs(options),
         ),
         overwrite=bool(options.overwrite),
-        progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
+        progress=replace(options.progress, num_plain_lines=1),
     )
     show(tables.to_json(comparison) if options.json else tables.summary(comparison))
     if not options.json:
@@ -195,7 +195,7 @@ def evaluate(options: argparse.Namespace) -> None:
             resources=given.resources(options),
         ),
         overwrite=bool(options.overwrite),
-        progress=given.progress(options),
+        progress=options.progress,
     )
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
@@ -215,7 +215,7 @@ def import_h5(options: argparse.Namespace) -> None:
         match_list_path=options.match_list_path,
         cameras=given.over(CameraOptions(), options, "cameras"),
         random_seed=options.random_seed or 0,
-        progress=given.progress(options),
+        progress=options.progress,
     )
     show(report.summary())
 
@@ -226,7 +226,7 @@ def panoramas(options: argparse.Namespace) -> None:
         options.target_path,
         order=options.order,
         random_seed=options.random_seed or 0,
-        progress=given.progress(options),
+        progress=options.progress,
     )
     num_all = len(list_images(options.image_path))
     for number, model in models.items():
@@ -242,7 +242,7 @@ def export_h5(options: argparse.Namespace) -> None:
         options.database_path,
         options.features_path,
         options.matches_path,
-        progress=given.progress(options),
+        progress=options.progress,
     )
     show(report.summary())
 
@@ -383,7 +383,7 @@ def serve(options: argparse.Namespace) -> None:
 
 def show_runs(options: argparse.Namespace) -> None:
     page = write_two_runs(
-        options.before, options.after, options.page_path, given.progress(options)
+        options.before, options.after, options.page_path, options.progress
     )
     show(f"page        {page}")
 
@@ -396,9 +396,7 @@ def show_pair(options: argparse.Namespace) -> None:
 
 
 def convert(options: argparse.Namespace) -> None:
-    report = convert_images(
-        options.image_path, options.target_path, given.progress(options)
-    )
+    report = convert_images(options.image_path, options.target_path, options.progress)
     show(report.summary())
     if report.failures:
         names = such_as(sorted(report.failures))
@@ -428,7 +426,7 @@ def weights(options: argparse.Namespace) -> None:
         show(f"{', '.join(options.keys)}: no weights are needed")
     elif options.action == "fetch":
         keys = keys or ["affnet", "orinet", "hardnet"]
-        fetched = files.fetch(keys, options.weights, progress=given.progress(options))
+        fetched = files.fetch(keys, options.weights, progress=options.progress)
         for path in fetched.values():
             show(str(path))
     else:

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -20,7 +19,6 @@ from colmap_affrect.options import Options, flat
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.pipeline.single_stages import one_stage
-from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe, with_settings
@@ -194,13 +192,9 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
             Workspace(options.output_path),
             resources(options),
             where,
-            progress(options),
+            options.progress,
             by_hand=by_hand(options) if options.command == "map" else NOTHING,
             command=options.words,
         )
         with one_stage(options.command, found, overwrite=bool(options.overwrite)):
             yield found
-
-
-def progress(options: argparse.Namespace) -> Progress:
-    return SILENT if options.quiet else Progress(sys.stderr)

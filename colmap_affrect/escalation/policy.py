@@ -27,6 +27,7 @@ from colmap_affrect.escalation.expected_gain import (
 )
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.progress import Forecast
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
@@ -233,6 +234,26 @@ class Situation:
             others=self.needless_after(number),
             budget_s=budget_s,
         )
+
+
+def forecast_of(
+    levels: Sequence[Level], usable: Collection[int], num_images: int, num_pairs: int
+) -> Forecast:
+    """Return what forecasts a run, with what may follow its first model.
+
+    Args:
+        levels: of the recipe.
+        usable: numbers of those whose weights are there.
+        num_images: photographs of the set.
+        num_pairs: pairs of the set.
+    """
+    num_learned = 0  # of a larger set learned matching takes no longer than the rest
+    for number in usable:
+        if kind_of(levels[number]) == LEARNED and number > 0 and num_images <= SMALL:
+            num_learned = num_pairs
+    return Forecast(
+        num_images, num_pairs, num_learned_pairs=num_learned, goes_on=len(levels) > 1
+    )
 
 
 def learned_step(situation: Situation) -> Step:

@@ -14,6 +14,7 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import ImageError, Option, OptionError
 from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.escalation.map_and_rematch import map_and_rematch
+from colmap_affrect.escalation.policy import forecast_of
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.reading import header_size
@@ -29,7 +30,7 @@ from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
 from colmap_affrect.pairs.lists import PairOptions, read_pairs
 from colmap_affrect.parallel.executor import Executor
-from colmap_affrect.progress import Forecast, GivenProgress, Progress
+from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.report import StageReport
@@ -117,7 +118,8 @@ def _run(
     )
     names = _checked_names(inputs, options, mapper)
     num_pairs = _num_pairs(names, options=options.pairs, image_path=image_path)
-    forecast = Forecast(len(names), num_pairs)
+    usable = options.resources.usable_levels(recipe.extraction)
+    forecast = forecast_of(recipe.levels, usable, len(names), num_pairs)
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     _prepare_parts(context, recipe)
     later = options.later_stages()
