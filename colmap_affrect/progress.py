@@ -30,8 +30,7 @@ AFTER_SHARE = 1.0
 of both, only it can tell."""
 FACTOR = 2.0  # that a forecast may be off; where it may be more, two are told; display
 GOES_ON_SHARE = 0.5
-"""Of the time that mapping has taken already: what it still takes, at least, since hypotheses
-follow the last photograph; measured on the same sets."""
+"""Of the time that mapping took already: hypotheses after the last image; measured there."""
 LIKELY_SHARE = 0.5  # of the time that all steps may take at most: most help; measured
 # Of a run: before, it has loaded files and networks, and says too little; display
 MIN_ELAPSED_S = 3.0

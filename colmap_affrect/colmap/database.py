@@ -48,8 +48,9 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         require_space(path, BYTES_OF_EMPTY_DATABASE)
         if path.exists() and not os.access(path, os.W_OK):
             raise DatabaseError(
-                f"{path}: cannot be written (it is read-only); permit that, and run the same "
-                "command again"
+                "cannot be written (it is read-only)",
+                where=path,
+                advice="permit that, and run the same command again",
             ) from error
         raise DatabaseError(
             f"not a usable COLMAP database, or in use by another program ({error})",

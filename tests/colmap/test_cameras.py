@@ -51,7 +51,9 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
     assert found["d.jpg"].params == (901, 902, 401, 301)
     assert (found["e.jpg"].cx, found["e.jpg"].cy) == (390.5, 310)
     assert (found["f.jpg"].model, found["f.jpg"].focal_px) == ("OPENCV", None)
-    assert found["f.jpg"].where.endswith("plates.csv, line 8")
+    where = found["f.jpg"].where
+    assert str(where.file.value).endswith("plates.csv")
+    assert where.part == "line 8"
 
 
 @pytest.mark.parametrize(("lines", "message"), [

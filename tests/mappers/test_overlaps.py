@@ -81,7 +81,7 @@ LEFT_SEES = Surface((500.0, 900.0), (0.0, 400.0), FAR, (LEFT,))
 
 def share_found(*before: Surface) -> float:
     """Return the share of what is expected in the right image that it shows."""
-    overlap = views_of([BOTH_SEE, LEFT_SEES, *before])._expected(LEFT, RIGHT)
+    overlap = views_of([BOTH_SEE, LEFT_SEES, *before]).overlap_with(RIGHT, [LEFT])
     return overlap.num_found / overlap.num_expected
 
 
@@ -132,7 +132,7 @@ def test_photographs_are_alike_from_similar_directions_and_at_similar_scales(
 def test_cells_of_three_points_say_nothing() -> None:
     cells = np.repeat([0, 1, 9], [6, 3, 5])
     is_found = cells == 0
-    found = _counted(cells, is_found)
+    found = _counted(cells, is_found, 1.0)
     assert found.num_found == 1.0
     of_eleven = 1.0 - (1.0 - np.array([6.0, 5.0]) / 11.0) ** 6  # six matches at random
     assert found.num_expected == pytest.approx(of_eleven.sum())
