@@ -56,7 +56,10 @@ UNSURE = ModelSummary(
 )
 
 
-pytestmark = pytest.mark.usefixtures("shapeless_features_are_known")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.usefixtures("shapeless_features_are_known"),
+]
 
 
 @pytest.fixture(scope="module")

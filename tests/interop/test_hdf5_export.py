@@ -28,6 +28,8 @@ from colmap_affrect.errors import DatabaseError, OptionError, StoreError
 from colmap_affrect.interop.hdf5 import export_h5, import_h5
 from colmap_affrect.pipeline import RunOptions
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def targets(tmp_path: Path) -> tuple[Path, Path]:

@@ -106,6 +106,7 @@ def summary_with(path: Path, moved: float) -> ModelSummary:
     return summaries[0]
 
 
+@pytest.mark.long
 def test_photographs_are_no_surer_than_a_wrong_principal_point_allows(
     tmp_path: Path,
 ) -> None:

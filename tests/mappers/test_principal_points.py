@@ -32,6 +32,8 @@ from colmap_affrect.mappers.principal_points import (
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.sparse import SHIFTED_AXES
 
+pytestmark = pytest.mark.long
+
 NUM_IMAGES = 6
 NOISE_PX = 0.4
 TRUE_FOCAL_PX = 900.0

@@ -26,6 +26,8 @@ from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import extract as extract_stage
 
+pytestmark = pytest.mark.long
+
 FIRST, SECOND = NAMES[:2]
 
 

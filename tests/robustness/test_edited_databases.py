@@ -22,6 +22,8 @@ from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.workspace import Workspace
 
+pytestmark = pytest.mark.long
+
 LAST_PAIR = "pair_id = (SELECT max(pair_id) FROM matches)"
 RENAMED = "UPDATE images SET name = 'x.png' WHERE image_id = 1"
 Change = Callable[[Path], object]

@@ -27,6 +27,8 @@ from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.interop.pycolmap_api import extract_features
 
+pytestmark = pytest.mark.long
+
 ROWS = [
     (
         "UPDATE images SET camera_id = 999 WHERE image_id = 1",

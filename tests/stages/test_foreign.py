@@ -19,6 +19,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.descriptors import match_database
 from colmap_affrect.stages.foreign import ForeignDatabase
 
+pytestmark = pytest.mark.long
+
 NUM_IMAGES = 4
 
 
