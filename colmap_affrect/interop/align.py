@@ -24,7 +24,7 @@ from colmap_affrect.colmap.model_files import (
 from colmap_affrect.errors import DatabaseError, Option, OptionError, Row
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.earth import why_not_on_earth
-from colmap_affrect.interop.consensus import agreeing
+from colmap_affrect.interop.consensus import agreeing, similarity
 from colmap_affrect.interop.consensus import residuals as residuals_of
 from colmap_affrect.interop.finished_models import read_finished_model, stand_upright
 from colmap_affrect.options import Options, Summarized, documented, takes_fields_of
@@ -268,7 +268,7 @@ def _not_fitting(old: Places, true: Places, *, is_on_earth: bool) -> dict[str, s
         spread = np.median(np.abs(after - np.median(after, axis=0)), axis=0)
         floor = TABLE_ERROR * float(np.linalg.norm(spread))
     agree = agreeing(before, after, floor)
-    found = pycolmap.estimate_sim3d(before[agree], after[agree])
+    found = similarity(before[agree], after[agree])
     if agree.all() or found is None:
         return {}
     off = residuals_of(found, before, after)
@@ -309,7 +309,7 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
                     " for the scale alone",
                 ),
             )
-    new_from_old = pycolmap.estimate_sim3d(before, after)
+    new_from_old = similarity(before, after)
     if new_from_old is None:
         raise OptionError(
             "the known places do not fit the model in any scale and rotation"

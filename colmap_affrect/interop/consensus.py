@@ -32,6 +32,38 @@ def residuals(new_from_old: pycolmap.Sim3d, before: Array, after: Array) -> Arra
     return np.asarray(np.linalg.norm(moved - after, axis=1))
 
 
+def similarity(before: Array, after: Array) -> pycolmap.Sim3d | None:
+    """Return the similarity that moves points to others, None where they lie on one line.
+
+    pycolmap finds none for points in a plane through the origin, as places of one height often
+    are: so both are moved out of such planes first.
+
+    Args:
+        before: (N, 3) points.
+        after: (N, 3) where they should be.
+
+    Returns:
+        The similarity of least squares (Umeyama, PAMI 1991), after from before.
+    """
+    offset_before = _offset_out_of_plane(before)
+    offset_after = _offset_out_of_plane(after)
+    found = pycolmap.estimate_sim3d(before + offset_before, after + offset_after)
+    if found is None:
+        return None
+    turn = pycolmap.Rotation3d()
+    moved_before = pycolmap.Sim3d(1.0, turn, offset_before)
+    moved_back = pycolmap.Sim3d(1.0, turn, -offset_after)
+    return moved_back * found * moved_before
+
+
+def _offset_out_of_plane(points: Array) -> Array:
+    """Return a (3,) offset after which no plane through the origin is near to points."""
+    middle = points.mean(axis=0)
+    _, sizes, directions = np.linalg.svd(points - middle)
+    size = sizes[0] / math.sqrt(len(points)) or 1.0
+    return np.asarray(directions[2] * size - middle)
+
+
 def agreeing(before: Array, after: Array, floor: float) -> Bools:
     """Return which places one similarity moves to where they should be, (N,).
 
@@ -51,7 +83,7 @@ def agreeing(before: Array, after: Array, floor: float) -> Bools:
     rank = 2 if count == 4 else max(count // 2, 3)  # of the residual that counts
     best = np.full(count, np.inf)
     for triple in _triples(count):
-        found = pycolmap.estimate_sim3d(before[triple], after[triple])
+        found = similarity(before[triple], after[triple])
         if found is None:
             continue
         off = residuals(found, before, after)

@@ -13,7 +13,7 @@ from exported_model import write_model
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.interop.align import Reference, _not_fitting, align
-from colmap_affrect.interop.consensus import agreeing
+from colmap_affrect.interop.consensus import agreeing, similarity
 
 ORIGIN = (49.5, 15.25, 300.0)
 WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
@@ -102,6 +102,32 @@ def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> No
     assert align(
         tmp_path / "model", tmp_path / "new", reference
     ).scale == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("wrong_row", [None, 4])
+def test_places_in_a_plane_through_the_origin_are_as_good_as_others(
+    wrong_row: int | None,
+) -> None:
+    # Of one height, as in many a table; the first is the origin itself.
+    after = np.random.default_rng(3).normal(size=(7, 3)) * [40.0, 25.0, 0.0]
+    after[0] = 0.0
+    old_from_true = TRUE_FROM_OLD.inverse()
+    before = np.array([old_from_true * place for place in after])
+    found = similarity(before, after)
+    assert found is not None
+    np.testing.assert_allclose(found.matrix(), TRUE_FROM_OLD.matrix(), atol=1e-9)
+    back = similarity(after, before)
+    assert back is not None
+    np.testing.assert_allclose(back.matrix(), old_from_true.matrix(), atol=1e-9)
+    if wrong_row is not None:
+        after[wrong_row, :2] += 300.0
+    expected = np.arange(7) != (-1 if wrong_row is None else wrong_row)
+    np.testing.assert_array_equal(agreeing(before, after, 0.1), expected)
+
+
+def test_places_on_a_line_leave_the_similarity_open() -> None:
+    line = np.outer(np.arange(4.0), [1.0, 2.0, 0.5])
+    assert similarity(line, 2.0 * line) is None
 
 
 WRONG = {
