@@ -164,7 +164,22 @@ def focal_growths(
     else:
         fewer = with_fewer_points(model)
     trials = _FocalTrials(fewer, priors, refining, constant)
-    return trials.growths_by_covariance(unknown) or trials.growths(unknown)
+    return _growths(trials, unknown)
+
+
+def _growths(trials: _FocalTrials, camera_ids: Sequence[int]) -> dict[int, float]:
+    """Return the growths by camera id, by the joint covariance where there is one.
+
+    Of one camera, nothing is left open together with others, but the cost may fall again beyond
+    what the covariance sees: unless that is sure of the focal length, it is tried as well.
+    """
+    found = trials.growths_by_covariance(camera_ids)
+    if not found:
+        return trials.growths(camera_ids)
+    (first, *others) = camera_ids
+    if not others and MIN_GROWTH < found[first] < MAX_GROWTH:
+        found[first] = min(found[first], trials.growth(camera_ids))
+    return found
 
 
 def fitting_focals(

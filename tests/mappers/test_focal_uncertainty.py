@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import USUAL_SIGMA, CameraPrior
 from colmap_affrect.mappers.focal_observability import (
     MIN_GROWTH,
+    _growths,
     fitting_focals,
     focal_growths,
 )
@@ -137,3 +139,33 @@ def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
     assert found.keys() == set(expected)
     for focal_px in found.values():
         assert focal_px == pytest.approx(FOCAL_PX, rel=0.05)
+
+
+class FakeTrials:
+    """Growths that are known beforehand."""
+
+    def __init__(self, by_covariance: dict[int, float], by_trial: float) -> None:
+        self.by_covariance = by_covariance
+        self.by_trial = by_trial
+
+    def growths_by_covariance(self, _: list[int]) -> dict[int, float]:
+        return dict(self.by_covariance)
+
+    def growth(self, _: list[int]) -> float:
+        return self.by_trial
+
+
+@pytest.mark.parametrize(
+    ("by_covariance", "by_trial", "expected"),
+    [
+        ({1: 0.016}, -0.026, {1: -0.026}),  # the cost falls again far from here
+        ({1: 0.016}, 0.4, {1: 0.016}),
+        ({1: 1.0}, -0.026, {1: 1.0}),  # sure of it: nothing is tried
+        ({1: 0.016, 2: 0.5}, -0.026, {1: 0.016, 2: 0.5}),
+    ],
+)
+def test_another_focal_length_is_tried_of_one_camera_that_is_not_sure_of_it(
+    by_covariance: dict[int, float], by_trial: float, expected: dict[int, float]
+) -> None:
+    trials: Any = FakeTrials(by_covariance, by_trial)
+    assert _growths(trials, sorted(by_covariance)) == expected
