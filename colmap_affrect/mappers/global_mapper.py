@@ -98,6 +98,7 @@ class GlobalMapper:
         random_seed: int,
         show: Callable[[int], None],
     ) -> list[MappedModel]:
+        """Do what :meth:`map` does, while no other of COLMAP's mappers is at work."""
         native = self.native(task, random_seed)
 
         def call(_: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:

@@ -6,7 +6,7 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.surer_apart import surer_apart
+from colmap_affrect.mappers.surer_apart import Score, surer_apart
 from colmap_affrect.mappers.surroundings import Places
 
 HERE = {1, 2, 3}
@@ -24,7 +24,7 @@ def places(unclear: dict[int, float] | None = None) -> Places:
     return Places([HERE | THERE], unclear=unclear or {}, tied=[HERE, THERE])
 
 
-def scores(together: float, alone: float) -> object:
+def scores(together: float, alone: float) -> Score:
     """Score images by one probability in the whole model and another one in parts."""
 
     def score(mapped: MappedModel) -> dict[int, float]:
@@ -43,7 +43,7 @@ def test_parts_are_apart_where_the_whole_is_doubtful_and_they_are_sure(
     together: float, alone: float, is_cut: bool
 ) -> None:
     mapped = synthetic_model()
-    found = surer_apart(mapped, places(), scores(together, alone))  # type: ignore[arg-type]
+    found = surer_apart(mapped, places(), scores(together, alone))
     assert found.images == ([HERE, THERE] if is_cut else [HERE | THERE])
     assert found.why == ("surer_apart" if is_cut else "other_surroundings")
     assert mapped.reconstruction.num_reg_images() == 5
@@ -51,11 +51,11 @@ def test_parts_are_apart_where_the_whole_is_doubtful_and_they_are_sure(
 
 def test_a_whole_that_is_unclear_is_doubtful() -> None:
     of_all = dict.fromkeys(HERE | THERE, 0.4)
-    found = surer_apart(synthetic_model(), places(of_all), scores(0.9, 0.9))  # type: ignore[arg-type]
+    found = surer_apart(synthetic_model(), places(of_all), scores(0.9, 0.9))
     assert found.images == [HERE, THERE]
     assert not found.unclear
 
 
 def test_one_part_alone_stays_as_it_is() -> None:
     one = Places([HERE | THERE], tied=[HERE | THERE])
-    assert surer_apart(synthetic_model(), one, scores(0.1, 0.9)) is one  # type: ignore[arg-type]
+    assert surer_apart(synthetic_model(), one, scores(0.1, 0.9)) is one
