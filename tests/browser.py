@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,13 +28,20 @@ needs_chromium = pytest.mark.skipif(
 )
 
 
+class BrowserError(Exception):
+    """What chromedriver says of a command that failed."""
+
+
 def _call(address: str, method: str = "POST", **arguments: Any) -> Any:
     """Send a command of WebDriver and return its value."""
     data = json.dumps(arguments).encode()
     headers = {"Content-Type": "application/json"}
     request = urllib.request.Request(address, data, headers, method=method)
-    with urllib.request.urlopen(request, timeout=60) as answer:
-        return json.load(answer)["value"]
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return json.load(answer)["value"]
+    except urllib.error.HTTPError as error:
+        raise BrowserError(json.load(error)["value"]["message"]) from None
 
 
 class Browser:
@@ -47,6 +55,10 @@ class Browser:
 
     def visit(self, address: str) -> None:
         _call(f"{self._address}/url", url=address)
+
+    def reload(self) -> None:
+        """Load the page again, and wait until it is there."""
+        _call(f"{self._address}/refresh")
 
     def run(self, script: str, *arguments: Any) -> Any:
         """Run a function body in the page and return what it returns."""

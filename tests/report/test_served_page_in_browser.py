@@ -11,7 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser, assert_fits_and_is_readable, chromium, needs_chromium
+from browser import (
+    Browser,
+    BrowserError,
+    assert_fits_and_is_readable,
+    chromium,
+    needs_chromium,
+)
 from command import on_photographs, run_in_process_of_its_own, start
 from small_scene import FOCAL_PX, IMAGE_SIZE, NAMES, world_to_camera, write_photographs
 
@@ -64,11 +70,16 @@ def corners_in_photograph(index: int) -> np.ndarray:
 
 
 def until(true: Callable[[], object]) -> None:
+    """Wait until something is true of a page, which may just be loaded again."""
+    said = ""
     for _ in range(600):
-        if true():
-            return
+        try:
+            if true():
+                return
+        except BrowserError as error:
+            said = str(error)
         time.sleep(0.1)
-    pytest.fail("it did not come")
+    pytest.fail(f"it did not come {said}")
 
 
 def address_of(process: subprocess.Popen[str]) -> str:
@@ -100,7 +111,7 @@ def test_marks_and_masks_are_mapped_at_a_click(browser: Browser, out: Path) -> N
                 marks.append(mark)
         browser.run(MARKED, marks)
         browser.run(PAINTED)
-        browser.run("location.reload()")
+        browser.reload()
         until(lambda: browser.run(SAID) == "")
         browser.click("#map-again button")
         until(lambda: browser.run(SAID).startswith("Mapped."))
