@@ -1,5 +1,6 @@
 """How good a run is, said first: a headline, a sentence what to do next, the models."""
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,10 @@ SIGNS: Mapping[Quality, str] = {
     "sure": "✓", "unsure": "~", "doubtful": "?", "missing": "-",
 }  # fmt: skip
 """What stands for a class beside its colour."""
+
+
+TOOLS = {"--tie-points": "tie-points", "--mask-path": "masks"}
+"""Sections of the page in which one makes what an option takes."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,13 @@ def verdict_of(
         counts=counts,
         components=_components(names, photographs),
     )
+
+
+def tool_of(command: str) -> str:
+    """Return the section of the page whose tool makes what a command takes; empty: none does."""
+    words = shlex.split(command)
+    sections = [section for option, section in TOOLS.items() if option in words]
+    return sections[0] if sections else ""
 
 
 def _counts(photographs: Sequence[PhotographReport]) -> dict[Quality, int]:

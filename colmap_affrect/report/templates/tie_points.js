@@ -453,6 +453,7 @@
     part("undo").disabled = !past.length;
     part("saved").hidden = true;
     panes.forEach((pane) => pane.draw());
+    page.tiePoints?.whenChanged?.();
   }
 
   // Files
@@ -536,8 +537,18 @@
     say(`Marks from before: ${marks.length}. Undo goes back to those of the run.`);
   }
   show();
-  // For a server that maps again: marks as it takes them, and the residuals that it returns.
+  // For other scripts: where the current point should be; for a server that maps again: marks as it
+  // takes them, and the residuals that it returns.
   page.tiePoints = {
+    current: () => current,
+    isMarked: (photo) => Boolean(markOf(current, photo)),
+    expected: (photo) => expected(current, photo),
+    goTo(photo) {
+      panes[1].load(photo);
+      panes[1].seek();
+      panes[1].canvas.scrollIntoView({ block: "nearest" });
+      panes[1].canvas.focus({ preventScroll: true });
+    },
     rows: () => ordered().map(({ point, photo, x, y }) => [point, photographs[photo][0], x, y]),
     take(residuals) {
       const errors = new Map(residuals.map(([point, name, px]) => [JSON.stringify([point, name]), px]));
