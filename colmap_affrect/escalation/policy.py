@@ -25,9 +25,10 @@ from colmap_affrect.escalation.expected_gain import (
     kind_of,
     statistics_of,
 )
+from colmap_affrect.forecast import Forecast
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.progress import Forecast
+from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
@@ -237,7 +238,11 @@ class Situation:
 
 
 def forecast_of(
-    levels: Sequence[Level], usable: Collection[int], num_images: int, num_pairs: int
+    levels: Sequence[Level],
+    usable: Collection[int],
+    num_images: int,
+    num_pairs: int,
+    megapixels: float = 0.0,
 ) -> Forecast:
     """Return what forecasts a run, with what may follow its first model.
 
@@ -246,13 +251,19 @@ def forecast_of(
         usable: numbers of those whose weights are there.
         num_images: photographs of the set.
         num_pairs: pairs of the set.
+        megapixels: of all photographs, at the size of processing.
     """
     num_learned = 0  # of a larger set learned matching takes no longer than the rest
     for number in usable:
         if kind_of(levels[number]) == LEARNED and number > 0 and num_images <= SMALL:
             num_learned = num_pairs
     return Forecast(
-        num_images, num_pairs, num_learned_pairs=num_learned, goes_on=len(levels) > 1
+        num_images,
+        num_pairs,
+        num_learned_pairs=num_learned,
+        goes_on=len(levels) > 1,
+        megapixels=megapixels,
+        num_cores=available_cores(),
     )
 
 

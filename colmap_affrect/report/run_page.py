@@ -139,15 +139,18 @@ def _facts(
     photographs: Mapping[str, PhotographReport],
     names: Sequence[str],
 ) -> list[list[tuple[str, str]]]:
-    """Return what the dialog says of each photograph, its reasons first."""
-    doubts = dict[str, tuple[Doubt, ...]]()
+    """Return what the dialog says of photographs, first reasons that their cards leave out."""
+    shared = dict[str, str]()
     for model in report.models:
-        doubts |= {**model.unsure, **model.doubtful}
+        doubts = {**model.unsure, **model.doubtful}
+        for name, reasons in doubts.items():
+            if not _own_reason(name, doubts):
+                shared[name] = text_of(reasons)
     found = []
     for name in names:
         facts = facts_of(photographs[name], report.lines.get(name))
-        if name in doubts:
-            facts.insert(0, ("Why not surer", text_of(doubts[name])))
+        if name in shared:
+            facts.insert(0, ("Why not surer", shared[name]))
         found.append(facts)
     return found
 

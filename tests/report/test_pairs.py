@@ -29,8 +29,8 @@ from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
-from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pair_lines import MAX_NUM_PAIRS, num_lines_of_pair
+from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
 from colmap_affrect.session.view_graph import ViewGraph

@@ -523,10 +523,12 @@
     if (!isSaved && !isKept) event.preventDefault();
   });
 
-  // First a photograph that is not registered, beside one that is.
-  const lost = usable.find(isLost) ?? usable[0];
+  // First a photograph that is not in the largest model, beside one that is: what it matches best.
+  const isPlaced = (photo) => looks.get(photo)?.model === 0;
+  const lost = usable.find(isLost) ?? usable.find((photo) => !isPlaced(photo)) ?? usable[0];
   const others = usable.filter((photo) => photo !== lost);
-  const shown = [lost, others.find((photo) => !isLost(photo)) ?? others[0]];
+  const nearest = data.neighbours[lost].map(([photo]) => photo).filter((photo) => others.includes(photo));
+  const shown = [lost, [...nearest, ...others].find(isPlaced) ?? others[0]];
   const panes = [];
   section.querySelectorAll("figure").forEach((figure, index) => panes.push(new Pane(figure, shown[index])));
   const before = kept();
