@@ -43,9 +43,7 @@ from colmap_affrect.report.why_not_sure import groups_of
 # More would make a page too large to be read or sent.
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
-MAX_NUM_NAMED = (
-    3  # photographs of a reason that are called by their names; others by numbers
-)
+MAX_NUM_NAMED = 3  # photographs of a reason that are called by their names
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 NUM_KEY_LETTERS = 16  # of the digests by which a browser keeps marks and masks
 
@@ -291,8 +289,9 @@ def _why_no_model(report: RunReport) -> list[str]:
 
 def _command_to_compare(output_path: Path) -> str:
     """Return the command that lays this run and a next one over each other."""
-    next_path = output_path.with_name(f"{output_path.name}-2")
-    return shlex.join(["colmap-affrect", "show-runs", str(output_path), str(next_path)])
+    this_path = output_path.absolute()  # "." has no name
+    next_path = this_path.with_name(f"{this_path.name}-2")
+    return shlex.join(["colmap-affrect", "show-runs", str(this_path), str(next_path)])
 
 
 def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:

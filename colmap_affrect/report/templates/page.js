@@ -53,6 +53,7 @@ const page = (() => {
     covers.hidden = !(shared.masks && data.tie_points.photographs[opened]);
     if (!dialog.open) dialog.showModal();
   }
+
   // The photographs that it shares most with; a click shows what.
   function showShares(others) {
     shares.hidden = !(others.length && shared.showPair);
