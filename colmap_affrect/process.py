@@ -33,8 +33,9 @@ from colmap_affrect.parallel.subprocesses import end_with
 
 # That a command has to end after Ctrl-C or SIGTERM, before it is killed; resource
 PATIENCE_S = 4.0
-# Until something says that packages are loaded, and on a terminal between two such lines; display
-QUIET_S = 4.0
+# Until something says that packages are loaded, and on a terminal between two such lines: with the
+# start of Python less than 5; display
+QUIET_S = 3.0
 TICK_S = 0.5  # between two looks at the clock; display
 LOADING = "loading: at work for {seconds:.0f} s"
 WITHOUT_MEMORY = " (perhaps for want of memory)"
