@@ -134,8 +134,7 @@ class Forecast:
             here_s = self._left_by_cost_s(now_s)
         if here_s is None and self._stage.cost:
             here_s = self._expected_left_s(now_s)
-        is_too_early = now_s - self._run_began_s < MIN_ELAPSED_S
-        if here_s is None or (is_too_early and not self._expected_unit_s):
+        if here_s is None or now_s - self._run_began_s < MIN_ELAPSED_S:
             return None
         if self._name == "map":
             here_s = max(here_s, self._left_of_map_s(now_s))

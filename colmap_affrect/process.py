@@ -38,6 +38,7 @@ PATIENCE_S = 4.0
 QUIET_S = 3.0
 TICK_S = 0.5  # between two looks at the clock; display
 LOADING = "loading: at work for {seconds:.0f} s"
+LOADED = "loading: done in {seconds:.0f} s"
 WITHOUT_MEMORY = " (perhaps for want of memory)"
 KEPT = (
     "run.log may say why, and what was done before is kept: run the same command again, or "
@@ -133,7 +134,7 @@ def _speak_meanwhile(began_s: float, wait: Callable[[float], bool]) -> None:
         began_s: when the process began, of the monotonic clock.
         wait: waits for some seconds, and returns whether they are loaded.
     """
-    if {"-q", "--quiet"} & {*sys.argv}:
+    if _is_quiet():
         return
 
     def speak() -> None:
@@ -149,6 +150,18 @@ def _speak_meanwhile(began_s: float, wait: Callable[[float], bool]) -> None:
                 wanted_s = passed_s + QUIET_S if is_watched else 2 * passed_s
 
     threading.Thread(target=speak, daemon=True).start()
+
+
+def _end_speaking(began_s: float) -> None:
+    """Say that packages are loaded, where that has taken long: the command speaks after seconds."""
+    passed_s = time.monotonic() - began_s
+    if passed_s >= QUIET_S and not _is_quiet():
+        say(LOADED.format(seconds=passed_s))
+
+
+def _is_quiet() -> bool:
+    """Return whether the command is to say nothing but its result."""
+    return not {"-q", "--quiet"}.isdisjoint(sys.argv)
 
 
 def _open_standard_streams() -> None:
@@ -273,6 +286,7 @@ def _work(began_s: float, tell_begin: Callable[[], None] | None = None) -> NoRet
         is_loaded.set()
         if tell_begin:
             tell_begin()
+        _end_speaking(began_s)
         _handle(interrupts.raise_first)
 
     for stream in (sys.stdout, sys.stderr):

@@ -15,6 +15,7 @@ from colmap_affrect.forecast import (
     COSTS,
     GOES_ON_SHARE,
     LEARNED_COSTS,
+    MIN_ELAPSED_S,
     Forecast,
 )
 from colmap_affrect.progress import (
@@ -152,6 +153,7 @@ def test_a_run_is_forecast_by_its_megapixels_before_a_photograph_is_done() -> No
     """Ten photographs of two megapixels take ten seconds on three cores, at first."""
     clock = Clock()
     forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0, num_cores=3)
+    clock.now_s += MIN_ELAPSED_S
     assert forecast.left_s() is None
     forecast.begin("extract", 10)
     units = 10 + 45 * (COSTS["match"] + COSTS["verify"]) + 12 * COSTS["map"]
