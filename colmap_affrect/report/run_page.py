@@ -43,7 +43,7 @@ from colmap_affrect.report.why_not_sure import groups_of
 # More would make a page too large to be read or sent.
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
-MAX_NUM_NAMED = 3  # photographs of a reason that are called by their names
+MAX_NUM_NAMED = 3  # photographs of a reason that are told by name; display
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 NUM_KEY_LETTERS = 16  # of the digests by which a browser keeps marks and masks
 
