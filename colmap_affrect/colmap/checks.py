@@ -138,11 +138,11 @@ def check_database(
             _check_keypoints(connection, tables, found)
             _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
-            if looks_for_moved and FATAL.isdisjoint(
-                found
-            ):  # else there may be no such rows
+            has_all_rows = FATAL.isdisjoint(found)
+            if looks_for_moved and has_all_rows:
                 moved = images_with_moved_keypoints(connection, tables)
-                found.update({"keypoints-moved": moved} if moved else {})
+                if moved:
+                    found["keypoints-moved"] = moved
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"damaged ({error})", where=path) from error
     return tables, dict(found)
@@ -159,11 +159,8 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         if not len(focals):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if (
-            params is None
-            or not np.isfinite(params).all()
-            or (params[0, focals] <= 0.0).any()
-        ):
+        is_finite = params is not None and np.isfinite(params).all()
+        if params is None or not is_finite or (params[0, focals] <= 0.0).any():
             found["bad-camera"].append(label)
         shorter = min(camera.width, camera.height)
         longer = max(camera.width, camera.height)
@@ -312,9 +309,9 @@ def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[s
 
 def _are_normalised(points: Floats) -> bool:
     """Tell whether (N, 2) keypoints are not in px, but in sides of their image."""
-    return len(points) >= MIN_NORMALISED and bool(
-        np.abs(points).max() <= MAX_NORMALISED
-    )
+    if len(points) < MIN_NORMALISED:
+        return False
+    return bool(np.abs(points).max() <= MAX_NORMALISED)
 
 
 def _are_outside(points: Floats, size: tuple[int, int]) -> bool:
@@ -353,9 +350,8 @@ def _check_pairs(
     connection: sqlite3.Connection, tables: Tables, found: Problems
 ) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
-        for pair_id, rows, columns, blob in rows_of(
-            connection, "pair_id rows cols data", table
-        ):
+        stored = rows_of(connection, "pair_id rows cols data", table)
+        for pair_id, rows, columns, blob in stored:
             image_ids = divmod(pair_id, MAX_NUM_IMAGES)
             matches = _array(blob, rows, columns, np.dtype("<u4"))
             if not _are_matches(matches, image_ids, tables):

@@ -153,9 +153,8 @@ def significance(
     Returns:
         The logarithm; infinite for a watermark, which cannot be tested.
     """
-    with np.errstate(
-        all="ignore"
-    ):  # points that a camera cannot undistort are no inliers
+    # Points that a camera cannot undistort are no inliers
+    with np.errstate(all="ignore"):
         model = pair_model(geometry, cameras, keypoints)
         if model is None:
             return math.inf

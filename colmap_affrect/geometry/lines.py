@@ -340,9 +340,8 @@ def _first_rotations(segments: Segments, random_seed: int) -> Floats:
     no_shift = np.zeros(NUM_TRIALS)
     kept = np.empty((len(FOCALS), NUM_KEPT, 3, 3))
     for number, focal in enumerate(FOCALS):
-        normals = _unit(
-            longest.lines * [focal, focal, 1.0]
-        )  # of planes with the camera's centre
+        # Of planes with the camera's centre
+        normals = _unit(longest.lines * [focal, focal, 1.0])
         rotations = _frames(normals[chosen])
         scores = VanishingFit(
             longest, rotations, np.full(NUM_TRIALS, focal), no_shift

@@ -3,12 +3,18 @@
 All points are (N, 2) px with the corner of the image at (0, 0). Sizes are (width, height) px.
 """
 
-import math
-
 import cv2
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import (
+    Array,
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Singles,
+    sampling_step,
+)
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
 
 Size = tuple[int, int]
@@ -203,8 +209,7 @@ def _rays(points: Array) -> Array:
 
 def _sampled(points: Array) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
-    step = max(1, math.ceil(len(points) / MAX_NUM_POINTS))
-    return points[::step]
+    return points[:: sampling_step(len(points), MAX_NUM_POINTS)]
 
 
 def text_line_matches(
@@ -235,10 +240,9 @@ def text_line_matches(
     if inliers is None or not inliers.any():
         return nothing
     on_line = inliers.ravel() > 0
-    are_lines = _is_text_line(points1[on_line], sizes[0]) and _is_text_line(
-        points2[on_line], sizes[1]
-    )
-    return on_line if are_lines else nothing
+    is_line1 = _is_text_line(points1[on_line], sizes[0])
+    is_line2 = _is_text_line(points2[on_line], sizes[1])
+    return on_line if is_line1 and is_line2 else nothing
 
 
 def _is_text_line(points: Array, size: Size) -> bool:
@@ -331,14 +335,15 @@ def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -
         The larger ratio of both axes.
     """
     if len(points2) < len(points1):
-        points1, points2, sizes = points2, points1, sizes[::-1]
+        return mirrored_share(points2, points1, (sizes[1], sizes[0]))
     size1, size2 = sizes
     if not len(points1):
         return 0.0
-    is_keypoint = np.zeros(
-        (size1[1] + 2 * MARGIN_PX, size1[0] + 2 * MARGIN_PX), np.uint8
-    )
-    is_keypoint[_pixels(points2 * np.divide(size1, size2), size1)] = 1
+    height = size1[1] + 2 * MARGIN_PX
+    width = size1[0] + 2 * MARGIN_PX
+    is_keypoint = np.zeros((height, width), np.uint8)
+    in_first = points2 * np.divide(size1, size2)
+    is_keypoint[_pixels(in_first, size1)] = 1
     is_near = np.asarray(cv2.dilate(is_keypoint, np.ones((3, 3), np.uint8)))
     ratios = [0.0]
     for axis in (0, 1):

@@ -85,8 +85,13 @@ def homogeneous(points: Floats) -> Array:
 
 def essential_matrix(rotation: Array, translation: Array) -> Array:
     """Return E with ``x2^T E x1 = 0`` for homogeneous rays."""
-    x, y, z = translation
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    return cross_product_matrix(translation) @ rotation
+
+
+def cross_product_matrix(vector: Array) -> Array:
+    """Return the (3, 3) matrix that maps others to the cross product of a (3,) vector with them."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True)

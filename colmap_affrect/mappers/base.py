@@ -85,12 +85,9 @@ class MappingTask:
     @property
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
-        photographs = self.image_path
-        return (
-            photographs
-            if photographs and photographs.is_dir()
-            else self.database_path.parent
-        )
+        if self.image_path and self.image_path.is_dir():
+            return self.image_path
+        return self.database_path.parent
 
     def refined_intrinsics(self, options: MapperOptions) -> RefinedIntrinsics:
         """Return what is to be refined, of at least one camera."""

@@ -33,9 +33,8 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
 # What made a model, in the words of a report.
-MEASURED_PAIRS = (
-    "with the pairs of measured frames"  # others also verify sides that look the same
-)
+# Others also verify sides that look the same
+MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
@@ -45,9 +44,8 @@ SHIFTED_AXES = "with optical axes off the middle"
 
 # Of COLMAP's models, the largest ones, that are gone on from; resource
 NUM_COLMAP_MODELS = 2
-FORWARD_MOTION = (
-    "mapper.init_max_forward_motion"  # option of pycolmap that users may give
-)
+# Option of pycolmap that users may give
+FORWARD_MOTION = "mapper.init_max_forward_motion"
 # Images from which on COLMAP's own pipeline maps: the search would take too long; resource
 MIN_LARGE_SET = 100
 
@@ -218,15 +216,19 @@ class SparseMapper(IncrementalMapper):
                 )
         priors = self._priors(task, graph, native)
         adjuster = Adjuster(
-            priors,
-            self.options.noise_px,
-            native.get_global_bundle_adjustment(),
-            self._constant_cameras(task, graph, native),
-            constant_frames,
-            tie_points_of(task, graph),
+            priors=priors,
+            noise_px=self.options.noise_px,
+            refining=native.get_global_bundle_adjustment(),
+            constant=self._constant_cameras(task, graph, native),
+            constant_frames=constant_frames,
+            tie_points=tie_points_of(task, graph),
         )
         return Search(
-            adjuster, ModelScorer(graph, priors), native, self.options.num_seeds, show
+            adjuster=adjuster,
+            scorer=ModelScorer(graph, priors),
+            native=native,
+            max_models_without_gain=self.options.num_seeds,
+            show=show,
         )
 
     def _priors(
@@ -237,22 +239,20 @@ class SparseMapper(IncrementalMapper):
     ) -> dict[int, CameraPrior]:
         """Return the priors of the focal lengths, by camera id."""
         if not native.ba_refine_focal_length:  # then they are those of the database
-            used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            return {
-                k: CameraPrior(float(c.mean_focal_length()), 0.0)
-                for k, c in used.items()
-            }
+            constant = {}
+            for camera in graph.cameras.values():
+                focal_px = float(camera.mean_focal_length())
+                constant[camera.camera_id] = CameraPrior(focal_px, sigma=0.0)
+            return constant
         priors = camera_priors(graph.cameras.values(), task.cameras, task.lines)
         if not self.options.keep_given_intrinsics:
             for key, prior in priors.items():
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
-        told = cameras_that_tell_distortion(graph)
-        return {
-            key: replace(
-                prior, has_distortion=key in told or prior.has_prior_focal_length
-            )
-            for key, prior in priors.items()
-        }
+        with_distortion = cameras_that_tell_distortion(graph)
+        for key, prior in priors.items():
+            has_distortion = key in with_distortion or prior.has_prior_focal_length
+            priors[key] = replace(prior, has_distortion=has_distortion)
+        return priors
 
     def _constant_cameras(
         self,

@@ -68,9 +68,8 @@ class RunContent:
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
     pair_lines: PairLines = field(default_factory=PairLines)
-    cameras: Mapping[str, pycolmap.Camera] = field(
-        default_factory=dict
-    )  # in the database
+    # In the database
+    cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     marks_command: str = ""  # maps again with marks that are saved
     masks_command: str = ""  # runs anew with masks that are saved
 

@@ -153,9 +153,8 @@ class RunReport(ReconstructionReport):
         if page is None:
             return f"Results: <code>{_text(str(self.output_path))}</code>"
         relative = os.path.relpath(page)
-        if relative.startswith(
-            os.pardir
-        ):  # notebooks show files below their folder only
+        # Notebooks show files below their folder only
+        if relative.startswith(os.pardir):
             return f"To look at: <code>{_text(str(page))}</code>"
         address = escape(Path(relative).as_posix(), quote=True)
         return f'To look at: <a href="{address}" target="_blank">{_text(relative)}</a>'
