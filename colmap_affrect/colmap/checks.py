@@ -158,7 +158,12 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         focals = like.focal_length_idxs()
         if not len(focals):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
-        params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
+        params = _array(
+            blob=camera.params,
+            rows=1,
+            columns=len(like.params),
+            dtype=np.dtype("<f8"),
+        )
         is_finite = params is not None and np.isfinite(params).all()
         if params is None or not is_finite or (params[0, focals] <= 0.0).any():
             found["bad-camera"].append(label)
@@ -214,7 +219,16 @@ def _check_sizes(connection: sqlite3.Connection, table: str, found: Problems) ->
     sizes = MATRICES[table]
     for name in sizes.keys() & columns_of(connection, table):
         for row, blob in rows_of(connection, f"rowid {name}", table):
-            if blob and _array(blob, 1, sizes[name], np.dtype("<f8")) is None:
+            if (
+                blob
+                and _array(
+                    blob=blob,
+                    rows=1,
+                    columns=sizes[name],
+                    dtype=np.dtype("<f8"),
+                )
+                is None
+            ):
                 found["matrix-data"].append(f"{name} of row {row} of {table}")
 
 
@@ -242,7 +256,12 @@ def _check_keypoints(
         if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-data"].append(f"{name} has {width}")
             continue
-        keypoints = _array(blob, count, width, np.dtype("<f4"))
+        keypoints = _array(
+            blob=blob,
+            rows=count,
+            columns=width,
+            dtype=np.dtype("<f4"),
+        )
         if keypoints is None:
             found["keypoint-data"].append(name)
             continue
@@ -267,7 +286,15 @@ def _check_descriptors(
 ) -> None:
     rows = rows_of(connection, "image_id rows cols data", "descriptors")
     for image_id, count, width, blob in rows:
-        if _array(blob, count, width, np.dtype("u1")) is None:
+        if (
+            _array(
+                blob=blob,
+                rows=count,
+                columns=width,
+                dtype=np.dtype("u1"),
+            )
+            is None
+        ):
             found["descriptor-data"].append(
                 tables.names.get(image_id, f"image {image_id}")
             )

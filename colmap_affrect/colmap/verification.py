@@ -384,7 +384,13 @@ def verify(
             todo = todo[may_be_verified]
         if len(todo):
             colmap_database.require_database_space(path, len(todo))
-            verify_pairs(database, todo, options, extracted_px, advance)
+            verify_pairs(
+                database=database,
+                pairs=todo,
+                options=options,
+                extracted_px=extracted_px,
+                advance=advance,
+            )
 
 
 def verify_pairs(
@@ -500,7 +506,12 @@ class PairVerifier:
             sides = (sides[1], sides[0])
             indices = indices[:, ::-1]
         size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry(sides, indices, self._options, size_px)
+        return estimate_geometry(
+            sides=sides,
+            matches=indices,
+            options=self._options,
+            extracted_px=size_px,
+        )
 
     def _side(self, name: str, lafs: Floats) -> Side:
         return Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))

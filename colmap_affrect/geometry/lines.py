@@ -179,10 +179,19 @@ class Lines:
         rotation = self.likelihood.rotations[row, column]
         segments = self.segments.undistorted(self.likelihood.distortion)
         fit = VanishingFit(
-            segments, rotation[None], np.array([focal]), np.array([shift])
+            segments=segments,
+            rotations=rotation[None],
+            focals=np.array([focal]),
+            shifts=np.array([shift]),
         )
         evidence = float(self.likelihood.log_likelihoods[row, column])
-        return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
+        return Explanation(
+            focal=focal,
+            shift=shift,
+            rotation=rotation,
+            kinds=fit.kinds()[0],
+            evidence=evidence,
+        )
 
 
 def measure_lines(segments: Segments) -> Lines:
@@ -274,11 +283,11 @@ def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood 
     lens = _likeliest_lens(segments, random_seed)
     grid = (len(FOCALS), len(SHIFTS))
     rotations, scores = refined(
-        segments.undistorted(lens.distortion),
-        np.repeat(lens.rotations, len(SHIFTS), axis=0),
-        np.repeat(FOCALS, len(SHIFTS)),
-        np.tile(SHIFTS, len(FOCALS)),
-        NUM_STEPS_FROM_THERE,
+        segments=segments.undistorted(lens.distortion),
+        rotations=np.repeat(lens.rotations, len(SHIFTS), axis=0),
+        focals=np.repeat(FOCALS, len(SHIFTS)),
+        shifts=np.tile(SHIFTS, len(FOCALS)),
+        num_steps=NUM_STEPS_FROM_THERE,
     )
     log_likelihoods = (scores.reshape(grid) + lens.of_others[:, None]) / TEMPER
     return LineLikelihood(
@@ -311,7 +320,11 @@ def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
     for number, distortion in enumerate(DISTORTIONS):
         straight = segments.undistorted(float(distortion))
         rotations[number], scores[number] = refined(
-            straight, starts, FOCALS, no_shift, NUM_STEPS_FROM_THERE
+            segments=straight,
+            rotations=starts,
+            focals=FOCALS,
+            shifts=no_shift,
+            num_steps=NUM_STEPS_FROM_THERE,
         )
     best = int(scores.max(axis=1).argmax())
     means = np.logaddexp.reduce(scores, axis=0) - math.log(len(DISTORTIONS))
@@ -324,7 +337,11 @@ def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Float
     starts = _first_rotations(segments, random_seed)
     focals = np.repeat(FOCALS, NUM_KEPT)
     found, scores = refined(
-        segments, starts.reshape(-1, 3, 3), focals, np.zeros(len(focals)), NUM_STEPS
+        segments=segments,
+        rotations=starts.reshape(-1, 3, 3),
+        focals=focals,
+        shifts=np.zeros(len(focals)),
+        num_steps=NUM_STEPS,
     )
     best = scores.reshape(-1, NUM_KEPT).argmax(axis=1)
     return np.asarray(found.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best])
@@ -344,7 +361,10 @@ def _first_rotations(segments: Segments, random_seed: int) -> Floats:
         normals = _unit(longest.lines * [focal, focal, 1.0])
         rotations = _frames(normals[chosen])
         scores = VanishingFit(
-            longest, rotations, np.full(NUM_TRIALS, focal), no_shift
+            segments=longest,
+            rotations=rotations,
+            focals=np.full(NUM_TRIALS, focal),
+            shifts=no_shift,
         ).scores()
         kept[number] = rotations[np.argsort(-scores, kind="stable")[:NUM_KEPT]]
     return kept

@@ -84,7 +84,12 @@ def pure_rotation_ratio(
     for focal_ratio in FOCAL_LENGTHS:
         focal_px = focal_ratio * max(sizes[0])
         lenses += [(focal_px, zoom) for zoom in zooms]
-    ratios = _rotation_ratios(centered1, centered2, np.array(lenses), error)
+    ratios = _rotation_ratios(
+        points1=centered1,
+        points2=centered2,
+        lenses=np.array(lenses),
+        error=error,
+    )
     return float(ratios.max())
 
 
@@ -124,11 +129,17 @@ def _rotation_ratios(
     # Lens by lens: what stays in the cache of a core is four times as fast.
     for index, focal2 in enumerate(focals2):
         start_errors = _rotation_errors(
-            starts_32[index], columns1_32[index], points2_32, float(focal2)
+            rotations=starts_32[index],
+            columns1=columns1_32[index],
+            points2=points2_32,
+            focal2=float(focal2),
         )
         best_start = _medians(start_errors).argmin()
         errors[index] = _rotation_errors(
-            starts[index, best_start, None], columns1[index], points2, float(focal2)
+            rotations=starts[index, best_start, None],
+            columns1=columns1[index],
+            points2=points2,
+            focal2=float(focal2),
         )[0]
     for _ in range(MAX_ITERATIONS):
         limits = np.maximum(error, _medians(errors))
@@ -137,7 +148,12 @@ def _rotation_ratios(
         for index, focal2 in enumerate(focals2):
             rotation = rotations[index, None]
             columns = columns1[index]
-            errors[index] = _rotation_errors(rotation, columns, points2, focal2)[0]
+            errors[index] = _rotation_errors(
+                rotations=rotation,
+                columns1=columns,
+                points2=points2,
+                focal2=focal2,
+            )[0]
     return np.asarray((errors <= error).mean(axis=1))
 
 

@@ -171,7 +171,11 @@ def refined(
     for begin in range(0, len(rotations), NUM_AT_ONCE):
         part = slice(begin, begin + NUM_AT_ONCE)
         best[part], scores[part] = _refined_at_once(
-            segments, rotations[part], focals[part], shifts[part], num_steps
+            segments=segments,
+            rotations=rotations[part],
+            focals=focals[part],
+            shifts=shifts[part],
+            num_steps=num_steps,
         )
     return best, scores
 

@@ -75,7 +75,12 @@ def sure_few_matches(
         inliers = matches[np.asarray(geometry.inlier_matches, np.int64)[:, 0]]
         if len(inliers) < MIN_INLIER_SHARE * len(matches):
             continue
-        of_chance = significance(geometry, both, points, options.max_error_px)
+        of_chance = significance(
+            geometry=geometry,
+            cameras=both,
+            keypoints=points,
+            max_error_px=options.max_error_px,
+        )
         evidence = max(of_chance, 0.0) + closures.log10_evidence(ids, inliers)
         if evidence >= options.min_significance:
             found.append(FewMatches(ids, inliers, geometry))

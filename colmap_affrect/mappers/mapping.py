@@ -121,10 +121,8 @@ def read_summaries(sparse_path: Path) -> list[ModelSummary]:
 
 def model_folders(sparse_path: Path) -> list[Path]:
     """Return the folders of the models that mapping has written, 0, 1, ..."""
-    if not sparse_path.is_dir():
-        return []
-    folders = [path for path in sparse_path.iterdir() if path.name.isdecimal()]
-    return sorted(folders, key=lambda path: int(path.name))
+    folders = sparse_path.iterdir() if sparse_path.is_dir() else ()
+    return sorted((p for p in folders if p.name.isdecimal()), key=lambda p: int(p.name))
 
 
 @dataclass
@@ -405,46 +403,19 @@ def _no_surer_than_ties(
     partners = _agreeing_partners(mapped, task)
     left = sorted(mapped.bridges.keys() & confidences.keys())
     found = {name: one for name, one in confidences.items() if name not in left}
-    tie = _surest_tie(left, partners, found)
-    while tie:
-        other = found[tie.other]
-        found[tie.name] = _no_surer_than(confidences[tie.name], tie.other, other)
-        left.remove(tie.name)
-        tie = _surest_tie(left, partners, found)
+    while left:
+        best: tuple[float, str, str] | None = None
+        for name in left:
+            for other in sorted(partners[name] & found.keys()):
+                probability = found[other].probability
+                if best is None or probability > best[0]:
+                    best = probability, name, other
+        if best is None:
+            break
+        _, name, other = best
+        found[name] = _no_surer_than(confidences[name], other, found[other])
+        left.remove(name)
     return {name: found.get(name, one) for name, one in confidences.items()}
-
-
-@dataclass(frozen=True)
-class _Tie:
-    """What a bridged image hangs on."""
-
-    name: str  # of the image
-    other: str  # name of the image that it hangs on
-
-
-def _surest_tie(
-    names: Sequence[str],
-    partners: Mapping[str, set[str]],
-    known: Mapping[str, Confidence],
-) -> _Tie | None:
-    """Return the tie of one of some images to the surest one that is known.
-
-    Args:
-        names: Of bridged images, sorted.
-        partners: Names of the images that agreeing pairs tie each image to.
-        known: Confidences by image name.
-
-    Returns:
-        The tie; None where no pair ties them to known ones.
-    """
-    best = None
-    highest = -math.inf
-    for name in names:
-        for other in sorted(partners[name] & known.keys()):
-            if known[other].probability > highest:
-                highest = known[other].probability
-                best = _Tie(name, other)
-    return best
 
 
 def _no_surer_than(one: Confidence, other_name: str, other: Confidence) -> Confidence:

@@ -156,7 +156,12 @@ def _motions_of_pair(
         return None
     far = matches[is_far]
     # No motion has more cells than all of the matches that contradict the model.
-    at_most = _Motions(pair, sides, matches[agrees], far)
+    at_most = _Motions(
+        pair=pair,
+        sides=sides,
+        own=matches[agrees],
+        other=far,
+    )
     if at_most.cells()[1] < MIN_CELLS:
         return None
     matched = keypoints1[far[:, 0]], keypoints2[far[:, 1]]

@@ -71,7 +71,10 @@ class Overlap:
         if not self.has_enough:
             return 0.0
         return beta_log_ratio(
-            self.num_found, self.num_expected, SAME_PLACE, OTHER_PLACE
+            num_agreeing=self.num_found,
+            num=self.num_expected,
+            right=SAME_PLACE,
+            wrong=OTHER_PLACE,
         )
 
     @property
@@ -334,7 +337,12 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
             tied.append(ids)
     found = Places([])
     found.tied = connected_parts(tied, images)
-    merged = _merged(found.tied, overlaps, views, found.unclear)
+    merged = _merged(
+        parts=found.tied,
+        pairs=overlaps,
+        views=views,
+        unclear=found.unclear,
+    )
     for place in merged:
         found.images += _cut_at_collages(place, overlaps, views, found.collages)
     found.images.sort(key=lambda part: (-len(part), min(part)))

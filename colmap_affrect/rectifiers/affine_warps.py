@@ -177,7 +177,14 @@ def plan_dense_shapes(
         for part in parts:
             if np.count_nonzero(part) >= min_part_blocks:
                 region = _region_of_blocks(part, grid.step_px, image_size)
-                items.append(options.warp(region, tilt, angle, label))
+                items.append(
+                    options.warp(
+                        region=region,
+                        tilt=tilt,
+                        angle_rad=angle,
+                        segment_id=label,
+                    )
+                )
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 

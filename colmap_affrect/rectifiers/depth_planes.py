@@ -212,5 +212,12 @@ class DepthAffNet(WithInputs):
             is_inside = segment.region.contains(samples.points)
             cover = options.cover(samples.metrics[is_inside])
             for tilt, angle in cover.centers.tolist():
-                items.append(options.warp(segment.region, tilt, angle, number))
+                items.append(
+                    options.warp(
+                        region=segment.region,
+                        tilt=tilt,
+                        angle_rad=angle,
+                        segment_id=number,
+                    )
+                )
         return RectificationPlan(photograph.size, tuple(items))
