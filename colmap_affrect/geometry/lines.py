@@ -268,19 +268,18 @@ def _likeliest(chances: Floats) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood | None:
+def line_likelihood(segments: Segments) -> LineLikelihood | None:
     """Return how likely focal lengths and shifts are by the straight lines of a photograph.
 
     Args:
         segments: of the photograph.
-        random_seed: of the frames that are tried.
 
     Returns:
         The likelihood; None where there are too few segments to say anything.
     """
     if len(segments) < MIN_NUM_SEGMENTS:
         return None
-    lens = _likeliest_lens(segments, random_seed)
+    lens = _likeliest_lens(segments)
     grid = (len(FOCALS), len(SHIFTS))
     rotations, scores = refined(
         segments=segments.undistorted(lens.distortion),
@@ -311,9 +310,9 @@ class _Lens:
     of_others: Floats
 
 
-def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
+def _likeliest_lens(segments: Segments) -> _Lens:
     """Compare distortions; the frames of each are found from those of a lens without any."""
-    starts = _rotations_of_centred_cameras(segments, random_seed)
+    starts = _rotations_of_centred_cameras(segments)
     no_shift = np.zeros(len(FOCALS))
     rotations = np.empty((len(DISTORTIONS), *starts.shape))
     scores = np.empty((len(DISTORTIONS), len(FOCALS)))
@@ -332,9 +331,9 @@ def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
     return _Lens(float(DISTORTIONS[best]), rotations[best], np.asarray(of_others))
 
 
-def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Floats:
+def _rotations_of_centred_cameras(segments: Segments) -> Floats:
     """Return the (F, 3, 3) rotations that explain most, without a shift and a distortion."""
-    starts = _first_rotations(segments, random_seed)
+    starts = _first_rotations(segments)
     focals = np.repeat(FOCALS, NUM_KEPT)
     found, scores = refined(
         segments=segments,
@@ -347,10 +346,10 @@ def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Float
     return np.asarray(found.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best])
 
 
-def _first_rotations(segments: Segments, random_seed: int) -> Floats:
+def _first_rotations(segments: Segments) -> Floats:
     """Return the (F, K, 3, 3) best of many frames for each focal length."""
     longest = segments.longest(NUM_SEGMENTS_OF_TRIALS)
-    random = np.random.default_rng(random_seed)
+    random = np.random.default_rng(0)
     importance = longest.weights * longest.lengths
     chances = importance / importance.sum()
     chosen = random.choice(len(longest), (NUM_TRIALS, 3), p=chances)
