@@ -236,8 +236,10 @@ def camera_prior(
     focal_px = float(camera.mean_focal_length())
     if record and "focal" in record.given:
         return CameraPrior(focal_px, 0.0)
-    is_known = record.source in TRUSTED if record else camera.has_prior_focal_length
-    if is_known:
+    is_trusted = camera.has_prior_focal_length
+    if record:
+        is_trusted = record.source in TRUSTED
+    if is_trusted:
         return CameraPrior(focal_px, EXIF_SIGMA)
     longer_px = max(camera.width, camera.height)
     measurements = _measurements_of_lines(lines)

@@ -94,12 +94,12 @@ def _direction_sigma_deg(
     first_pose = model.images[first].cam_from_world()
     second_pose = model.images[second].cam_from_world()
     rotation: Array = first_pose.rotation.matrix() @ second_pose.rotation.matrix().T
-    center: Array = rotation @ second_pose.translation
-    to_second: Array = first_pose.translation - center
+    carried: Array = rotation @ second_pose.translation
+    to_second: Array = first_pose.translation - carried
     distance = float(np.linalg.norm(to_second))
     if distance == 0.0:
         return math.inf
-    by_first_rotation = 2.0 * cross_product_matrix(center)
+    by_first_rotation = 2.0 * cross_product_matrix(carried)
     by_second_rotation = -2.0 * rotation @ cross_product_matrix(second_pose.translation)
     jacobian = np.hstack([by_first_rotation, np.eye(3), by_second_rotation, -rotation])
     direction = to_second / distance
