@@ -95,8 +95,8 @@ class ByHand(Options):
         """
         if first in self.left_out or second in self.left_out:
             return False
-        pair = {first, second}
-        return all(pair != set(rejected) for rejected in self.rejected)
+        rejected = self.rejected
+        return (first, second) not in rejected and (second, first) not in rejected
 
     def texts(self) -> tuple[str, ...]:
         """Return what is said, in a few words each."""

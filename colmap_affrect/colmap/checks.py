@@ -219,16 +219,15 @@ def _check_sizes(connection: sqlite3.Connection, table: str, found: Problems) ->
     sizes = MATRICES[table]
     for name in sizes.keys() & columns_of(connection, table):
         for row, blob in rows_of(connection, f"rowid {name}", table):
-            if (
-                blob
-                and _array(
-                    blob=blob,
-                    rows=1,
-                    columns=sizes[name],
-                    dtype=np.dtype("<f8"),
-                )
-                is None
-            ):
+            if not blob:
+                continue
+            matrix = _array(
+                blob=blob,
+                rows=1,
+                columns=sizes[name],
+                dtype=np.dtype("<f8"),
+            )
+            if matrix is None:
                 found["matrix-data"].append(f"{name} of row {row} of {table}")
 
 
@@ -286,15 +285,13 @@ def _check_descriptors(
 ) -> None:
     rows = rows_of(connection, "image_id rows cols data", "descriptors")
     for image_id, count, width, blob in rows:
-        if (
-            _array(
-                blob=blob,
-                rows=count,
-                columns=width,
-                dtype=np.dtype("u1"),
-            )
-            is None
-        ):
+        descriptors = _array(
+            blob=blob,
+            rows=count,
+            columns=width,
+            dtype=np.dtype("u1"),
+        )
+        if descriptors is None:
             found["descriptor-data"].append(
                 tables.names.get(image_id, f"image {image_id}")
             )
