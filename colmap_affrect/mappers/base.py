@@ -6,7 +6,7 @@ Entry points of other packages are in the group ``colmap_affrect.mappers``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
@@ -134,6 +134,16 @@ class MappedModel:
     """Pairs that tell that all its images are of one place, where somebody has looked."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
+
+    def first_by(self, hypothesis: str) -> MappedModel:
+        """Return the model with the name of a hypothesis before those that it has."""
+        hypotheses = tuple(dict.fromkeys((hypothesis, *self.hypotheses)))
+        return replace(self, hypotheses=hypotheses)
+
+    def also_by(self, hypothesis: str) -> MappedModel:
+        """Return the model with the name of a hypothesis after those that it has."""
+        hypotheses = tuple(dict.fromkeys((*self.hypotheses, hypothesis)))
+        return replace(self, hypotheses=hypotheses)
 
 
 class Mapper(Protocol):

@@ -352,11 +352,11 @@ class _HypothesisTest:
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
             models = _of_some_tracks(self.search, graph) or self.search.best(graph)
-            return _made_by(hypothesis.name, models)
+            return [mapped.first_by(hypothesis.name) for mapped in models]
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
         models = self.search.extend_models(graph, self.best)
-        return [_also_by(hypothesis.name, mapped) for mapped in models]
+        return [mapped.also_by(hypothesis.name) for mapped in models]
 
     def _take(self, models: Sequence[MappedModel], score: float) -> None:
         self.best = list(models)
@@ -386,7 +386,7 @@ class _HypothesisTest:
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
-            self._take(_made_by(COLMAP_MODEL, found), score)
+            self._take([mapped.first_by(COLMAP_MODEL) for mapped in found], score)
 
     def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
         """Go on with the cameras, and the optical axes, that models had."""
@@ -437,11 +437,8 @@ class _HypothesisTest:
         model = self.best[0].reconstruction
         changed = with_shifted_axes(model, free, search.graph)
         share = self._motion_share(self.best[0])
-        changed_model = _also_by(
-            SHIFTED_AXES,
-            replace(self.best[0], reconstruction=changed, motion_share=share),
-        )
-        found = free.with_bridges(search.graph, [changed_model])
+        first = replace(self.best[0], reconstruction=changed, motion_share=share)
+        found = free.with_bridges(search.graph, [first.also_by(SHIFTED_AXES)])
         found = with_new_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         # That the points ask for it has paid for the principal points.
@@ -467,13 +464,10 @@ class _HypothesisTest:
         if score <= self.score + MIN_SCORE_GAIN:
             return
         share = self._motion_share(first)
-        changed = _also_by(
-            PER_IMAGE_CAMERAS,
-            replace(first, reconstruction=model, motion_share=share),
-        )
+        changed = replace(first, reconstruction=model, motion_share=share)
         # The others, too: what is shared and what is not do not fit into one graph.
         others = [_remade(self.per_image, mapped) for mapped in self.best[1:]]
-        self.best = with_new_images([changed, *others])
+        self.best = with_new_images([changed.also_by(PER_IMAGE_CAMERAS), *others])
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
@@ -500,24 +494,9 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _made_by(name: str, models: Sequence[MappedModel]) -> list[MappedModel]:
-    """Return models with the name of a hypothesis before those that each of them has."""
-    found = list[MappedModel]()
-    for mapped in models:
-        hypotheses = tuple(dict.fromkeys((name, *mapped.hypotheses)))
-        found.append(replace(mapped, hypotheses=hypotheses))
-    return found
-
-
-def _also_by(name: str, mapped: MappedModel) -> MappedModel:
-    """Return a model with the name of a hypothesis after those that it has."""
-    hypotheses = tuple(dict.fromkeys((*mapped.hypotheses, name)))
-    return replace(mapped, hypotheses=hypotheses)
-
-
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
     """Return models with the poses of previous ones, and all that their tracks now register."""
-    return with_new_images(_also_by(AGAIN, _remade(search, one)) for one in previous)
+    return with_new_images(_remade(search, one).also_by(AGAIN) for one in previous)
 
 
 def _remade(search: Search, mapped: MappedModel) -> MappedModel:
