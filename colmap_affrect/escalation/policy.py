@@ -335,8 +335,8 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
     return Plan(max(hopeful, key=lambda step: step.rate), min(left_s, all_s))
 
 
-def tried(situation: Situation) -> list[MatchedAgain]:
-    """Return for how many pairs each level of escalation was tried."""
+def matched_by_level(situation: Situation) -> list[MatchedAgain]:
+    """Return how many pairs were matched again at each level of escalation, if any."""
     found = list[MatchedAgain]()
     for number in range(1, len(situation.levels)):
         pairs = situation.pairs_tried(number)
@@ -347,7 +347,7 @@ def tried(situation: Situation) -> list[MatchedAgain]:
     return found
 
 
-def untried(situation: Situation) -> list[MatchedAgain]:
+def untried_by_level(situation: Situation) -> list[MatchedAgain]:
     """Return what a greater effort would try for images to match again, by level."""
     found = list[MatchedAgain]()
     for number in situation.usable:

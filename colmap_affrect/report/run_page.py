@@ -22,6 +22,7 @@ from colmap_affrect.project.report import (
     SOURCES,
     ModelSummary,
     by_story,
+    largest_of,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -71,9 +72,8 @@ class RunContent:
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
     pair_lines: PairLines = field(default_factory=PairLines)
-    cameras: Mapping[str, pycolmap.Camera] = field(
-        default_factory=dict
-    )  # in the database
+    # In the database
+    cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     marks_command: str = ""  # maps again with marks that are saved
     masks_command: str = ""  # runs anew with masks that are saved
 
@@ -193,7 +193,7 @@ def _content(
 ) -> dict[str, Any]:
     """Return the variables of the template."""
     names = content.names
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    model = largest_of(report.models)
     verdict = verdict_of(report, names, photographs)
     return {
         "report": report,
@@ -314,7 +314,7 @@ def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:
 
 def _tools(report: RunReport, content: RunContent) -> dict[str, Any]:
     """Return what the tools for tie points and masks begin with."""
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    model = largest_of(report.models)
     names = content.names
     index = {name: number for number, name in enumerate(names)}
     errors_px = {(one.point, one.image): one.error_px for one in model.tie_points}

@@ -46,20 +46,17 @@ class View3D:
     """A model ready for the page; lengths in units of the radius of the view."""
 
     num_points: int = 0
-    points: str = (
-        ""  # base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
-    )
-    cameras: tuple[
-        tuple[str, Array], ...
-    ] = ()  # names; (5, 3) centre and corners of pyramids
+    # Base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
+    points: str = ""
+    # Names; (5, 3) centre and corners of pyramids
+    cameras: tuple[tuple[str, Array], ...] = ()
     # Base64: (N,) uint16 numbers of observations, then their (K,) uint16 rows of ``cameras``, then
     # (K, 2) uint16 places, 65535 at the right and lower border of the photograph
     tracks: str = ""
     looks: tuple[dict[str, Any], ...] = ()  # how each camera sees, for the script
     note: str = ""  # why there is nothing to draw; empty if there is
-    kinds: Mapping[str, str] = field(
-        default_factory=dict
-    )  # colours of cameras, by photograph
+    # Colours of cameras, by photograph
+    kinds: Mapping[str, str] = field(default_factory=dict)
 
     def script_data(self, index: Mapping[str, int]) -> dict[str, Any]:
         """Return what the script of the page reads, as JSON has it.

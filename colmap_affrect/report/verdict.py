@@ -31,9 +31,8 @@ class Component:
 
     title: str
     photographs: tuple[int, ...]  # their numbers, from 0
-    counts: Mapping[
-        Quality, int
-    ]  # of its photographs by class, without classes of none
+    # Of its photographs by class, without classes of none
+    counts: Mapping[Quality, int]
     view: int | None  # number of the model
 
 
