@@ -20,6 +20,7 @@ from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOption
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
+from colmap_affrect.mappers.point_joining import joined_by_points
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
     contradict_constant,
@@ -43,8 +44,7 @@ PER_IMAGE_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
-# Of COLMAP's models, the largest ones, that are gone on from; resource
-NUM_COLMAP_MODELS = 2
+NUM_COLMAP_MODELS = 2  # of COLMAP's, the largest, that are gone on from; resource
 FORWARD_MOTION = (
     "mapper.init_max_forward_motion"  # option of pycolmap that users may give
 )
@@ -147,16 +147,15 @@ class SparseMapper(IncrementalMapper):
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
         bare = replace(task, image_path=None, snapshot_path=None)
-        by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
+        seed = native.random_seed
+        whole_by_colmap = partial(super().map, bare, output_path, seed, show)
 
         def map_some(some: PairGraph) -> list[MappedModel]:
             # COLMAP's own mapper, which would take all pairs, makes none.
             return self._tested(task, some, native, show, by_colmap=list)
 
-        if task.without_pairs:
-            best = map_some(graph)
-        else:
-            best = self._tested(task, graph, native, show, by_colmap)
+        by_colmap = list if task.without_pairs else whole_by_colmap
+        best = self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_some)
         for mapped in best:
@@ -329,6 +328,7 @@ class _HypothesisTest:
         self._try_straight_lens()
         self._try_shifted_axes()
         self.best = with_other_groups(self.search, self.best)
+        self.best = joined_by_points(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
 
     def _hypotheses(self) -> list[_Hypothesis]:
