@@ -36,7 +36,7 @@ from colmap_affrect.mappers.wrong_models import (
     NUM_OTHER_HYPOTHESES,
     WITHOUT_FALSE_PAIRS,
     ThrownAway,
-    pairs_that_agree,
+    pairs_stood_on,
     pairs_to_leave_out,
     thrown_away_of,
     write_thrown_away,
@@ -214,7 +214,7 @@ class _Judged:
             stood_on = set[Ids]()
             image_ids = set[int]()
             if not self.task.extend:  # of which nothing is taken out
-                stood_on = pairs_that_agree(mapped.reconstruction, self.graph)
+                stood_on = pairs_stood_on(mapped.reconstruction, self.graph)
                 image_ids.update(mapped.reconstruction.reg_image_ids())
             scored = scored_places(mapped, self.task)
             self.scored += scored

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 from colmap_affrect.colmap import pycolmap
@@ -173,21 +173,43 @@ def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> ScoredModel
 def no_surer_than_ties(
     confidences: Mapping[str, Confidence], mapped: MappedModel, task: MappingTask
 ) -> dict[str, Confidence]:
-    """Return confidences of which those of bridged images are at most what they hang on.
+    """Return confidences that are at most those of what images hang on.
 
-    A bridged image hangs on the surest image that an agreeing pair ties it to; where that is a
-    bridged one, on what that hangs on, too. So what counts is the way to an image that was not
-    bridged whose least sure image is surest. Images that no such way leads to stay as they are.
+    An image hangs on the surest image that an agreeing pair ties it to. Where it was bridged, and
+    that one, too, it hangs on what that hangs on: what counts is the way to an image that was not
+    bridged whose least sure image is surest. Images that nothing ties stay as they are.
 
     Args:
         confidences: By image name.
         mapped: The model.
         task: What it was made from.
     """
-    if not mapped.bridges:
-        return dict(confidences)
+    if task.extend and not mapped.bridges:
+        return dict(confidences)  # nothing is known of pairs among the images it had
     partners = _agreeing_partners(mapped, task)
-    left = sorted(mapped.bridges.keys() & confidences.keys())
+    found = _bridged_no_surer(confidences, mapped.bridges.keys(), partners)
+    capped = dict(found)
+    for name in found.keys() - mapped.bridges.keys():
+        others = sorted(partners[name] & found.keys())
+        if others:
+            surest = max(others, key=lambda other: found[other].probability)
+            capped[name] = _no_surer_than(found[name], surest, found[surest])
+    return capped
+
+
+def _bridged_no_surer(
+    confidences: Mapping[str, Confidence],
+    bridged: Set[str],
+    partners: Mapping[str, Set[str]],
+) -> dict[str, Confidence]:
+    """Return confidences of which those of bridged images are at most what they hang on.
+
+    Args:
+        confidences: By image name.
+        bridged: Names of the bridged images.
+        partners: Names of the images that agreeing pairs tie each one to.
+    """
+    left = sorted(bridged & confidences.keys())
     found = {name: one for name, one in confidences.items() if name not in left}
     while left:
         best: tuple[float, str, str] | None = None

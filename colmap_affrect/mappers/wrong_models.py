@@ -91,15 +91,19 @@ def copy_thrown_away(sparse_path: Path, target: Path) -> None:
         shutil.copy(path, target / THROWN_AWAY)
 
 
-def pairs_that_agree(model: pycolmap.Reconstruction, graph: PairGraph) -> set[Ids]:
-    """Return the pairs that a model stands on: most of their inliers agree with its poses."""
+def pairs_stood_on(model: pycolmap.Reconstruction, graph: PairGraph) -> set[Ids]:
+    """Return the pairs that a model stands on: most of their inliers agree with its poses.
+
+    A model that none of its pairs agrees with stands on all of them.
+    """
     poses = poses_of(model)
     cameras = cameras_of(model)
+    inside = graph.pairs_inside(poses)
     found = set[Ids]()
-    for pair in graph.pairs_inside(poses):
+    for pair in inside:
         if graph.agreement(pair, poses, cameras) >= MIN_SHARE:
             found.add(pair.ids)
-    return found
+    return found or {pair.ids for pair in inside}
 
 
 def pairs_to_leave_out(

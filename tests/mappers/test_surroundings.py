@@ -40,6 +40,7 @@ from colmap_affrect.mappers.surroundings import (
     known_places,
     places_of,
 )
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
@@ -164,7 +165,26 @@ def test_bridged_photograph_is_no_surer_than_what_it_hangs_on(tmp_path: Path) ->
     found = no_surer_than_ties(alone, mapped, task)
     assert found["5.jpg"].probability == 0.3
     assert found["5.jpg"].reasons[0].code == "hangs_on"
-    assert no_surer_than_ties(held, mapped, task) == held
+    held_up = no_surer_than_ties(held, mapped, task)
+    assert held_up["5.jpg"].probability == 0.95
+    assert held_up["3.jpg"].probability == 0.95  # alone sure, it would mean nothing
+
+
+def test_one_photograph_alone_is_no_surer_than_the_surest_that_ties_it(
+    tmp_path: Path,
+) -> None:
+    """What is sure is where two stand to each other."""
+    path = tmp_path / "database.db"
+    mapped = MappedModel(scene(path, everything))
+    given = {f"{number}.jpg": Confidence(0.1 * number, ()) for number in range(6)}
+    given["5.jpg"] = Confidence(0.95, (Doubt("few_matches"),))
+    found = no_surer_than_ties(given, mapped, task_with_given_cameras(path))
+    assert found["5.jpg"].probability == 0.4
+    codes = [doubt.code for doubt in found["5.jpg"].reasons]
+    assert codes == ["hangs_on", "few_matches"]
+    assert found["5.jpg"].reasons[0].values == {"other": "4.jpg", "percent": 40}
+    others = {name: one for name, one in given.items() if name != "5.jpg"}
+    assert {name: found[name] for name in others} == others
 
 
 def test_photograph_hangs_on_what_the_one_it_hangs_on_hangs_on(tmp_path: Path) -> None:
