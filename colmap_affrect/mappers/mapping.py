@@ -26,7 +26,9 @@ from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     Ids,
     PairGraph,
+    cameras_of,
     graph_of,
+    poses_of,
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
 from colmap_affrect.mappers.scored_models import ScoredModel, scored_places
@@ -211,17 +213,14 @@ class _Judged:
     def add(self, found: Sequence[MappedModel]) -> None:
         """Score models, and keep what is large enough of them."""
         for mapped in found:
-            stood_on = set[Ids]()
-            image_ids = set[int]()
-            if not self.task.extend:  # of which nothing is taken out
-                stood_on = pairs_stood_on(mapped.reconstruction, self.graph)
-                image_ids.update(mapped.reconstruction.reg_image_ids())
+            poses = poses_of(mapped.reconstruction)  # before images leave it
+            cameras = cameras_of(mapped.reconstruction)
             scored = scored_places(mapped, self.task)
             self.scored += scored
             self.kept += [one for one in scored if len(one.confidences) >= self.least]
             if not any(one.confidences for one in scored):
-                self.stood_on |= stood_on
-                self._of_wrong_models |= image_ids
+                self.stood_on |= pairs_stood_on(self.graph, poses, cameras)
+                self._of_wrong_models.update(poses)
 
     def image_ids_left(self) -> set[int]:
         """Return the images that no model has, where one was thrown away; else none.

@@ -14,14 +14,13 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import DAMAGE
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
+    CameraById,
     Ids,
     PairGraph,
-    cameras_of,
-    poses_of,
+    PoseById,
 )
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
@@ -80,7 +79,7 @@ def read_thrown_away(sparse_path: Path) -> ThrownAway:
         return ThrownAway()
     try:
         return _FILE.validate_json(read_regular(path))
-    except DAMAGE:  # it says more of photographs, and nothing hangs on it
+    except DAMAGE:  # it only says more; mapping again makes it again
         return ThrownAway()
 
 
@@ -91,14 +90,17 @@ def copy_thrown_away(sparse_path: Path, target: Path) -> None:
         shutil.copy(path, target / THROWN_AWAY)
 
 
-def pairs_stood_on(model: pycolmap.Reconstruction, graph: PairGraph) -> set[Ids]:
+def pairs_stood_on(graph: PairGraph, poses: PoseById, cameras: CameraById) -> set[Ids]:
     """Return the pairs that a model stands on: most of their inliers agree with its poses.
 
     A model that none of its pairs agrees with stands on all of them.
+
+    Args:
+        graph: All pairs.
+        poses: cam_from_world of the images of the model, by image id.
+        cameras: Of these images, by image id.
     """
-    poses = poses_of(model)
-    cameras = cameras_of(model)
-    inside = graph.pairs_inside(poses)
+    inside = [pair for pair in graph.verified if poses.keys() >= {*pair.ids}]
     found = set[Ids]()
     for pair in inside:
         if graph.agreement(pair, poses, cameras) >= MIN_SHARE:
@@ -148,7 +150,7 @@ def thrown_away_of(
         The same, with the pairs of these photographs alone.
     """
     pairs = list[StoodOn]()
-    for pair in graph.pairs:
+    for pair in graph.verified:
         first, second = (graph.names[image_id] for image_id in pair.ids)
         is_of_them = first in doubts or second in doubts
         if pair.ids in stood_on and is_of_them:

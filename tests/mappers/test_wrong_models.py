@@ -17,7 +17,7 @@ from colmap_affrect.colmap.model_files import pose_errors, read_poses, relative_
 from colmap_affrect.mappers import scored_models
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.mappers.wrong_models import (
     NUM_OTHER_HYPOTHESES,
@@ -156,12 +156,16 @@ def test_a_mapper_that_takes_all_pairs_maps_once(
 def test_a_model_stands_on_the_pairs_stood_on_with_it(scene: Scene) -> None:
     graph = PairGraph.read(scene.path)
     ids = sorted(scene.truth.reg_image_ids())
-    assert pairs_stood_on(scene.truth, graph) == set(combinations(ids, 2))
-    assert pairs_stood_on(turned(scene), graph) == set(combinations(ids[:-1], 2))
+
+    def stood_on(model: pycolmap.Reconstruction) -> set[tuple[int, int]]:
+        return pairs_stood_on(graph, poses_of(model), cameras_of(model))
+
+    assert stood_on(scene.truth) == set(combinations(ids, 2))
+    assert stood_on(turned(scene)) == set(combinations(ids[:-1], 2))
     two = turned(scene)
     for image_id in ids[1:-1]:
         two.deregister_frame(two.images[image_id].frame_id)
-    assert pairs_stood_on(two, graph) == {(ids[0], ids[-1])}  # which disagrees
+    assert stood_on(two) == {(ids[0], ids[-1])}  # which disagrees
 
 
 def test_pairs_are_left_out_that_a_wrong_model_stood_on_or_are_of_other_images(
