@@ -70,7 +70,13 @@ class PointJoiner:
         return found
 
     def _joined(self, first: MappedModel, second: MappedModel) -> MappedModel | None:
-        """Return a model of the images of two; None where the score is not for it."""
+        """Return a model of the images of two; None where the score is not for it.
+
+        A model that has no image of its own is left as it is.
+        """
+        inside = set(first.reconstruction.reg_image_ids())
+        if inside.issuperset(second.reconstruction.reg_image_ids()):
+            return None
         aligned = self._aligned(first.reconstruction, second.reconstruction)
         if aligned is None:
             return None

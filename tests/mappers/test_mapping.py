@@ -195,7 +195,7 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
 def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = [0.49996, 0.89996, 0.99996]
+    given = [0.49996, 0.89996, 0.99996, 0.99996]
 
     def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(image.name for image in mapped.reconstruction.images.values())
@@ -205,14 +205,14 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
         }
 
     path = tmp_path / "database.db"
-    synthesize(path, num_rigs=3, num_points3D=150)
+    synthesize(path, num_rigs=4, num_points3D=150)
     monkeypatch.setattr(scored_models, "score_images", scored)
     (model,), _ = reconstruct(path, mapper_of("incremental"))
-    first, second, third = model.registered_names
-    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
+    first, second, *others = model.registered_names
+    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999, 0.999]
     doubts = (Doubt("few_matches"),)
     assert (model.doubtful, model.unsure) == ({first: doubts}, {second: doubts})
-    assert model.sure == (third,)
+    assert model.sure == tuple(others)
 
 
 def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(

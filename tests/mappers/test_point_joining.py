@@ -109,3 +109,11 @@ def test_models_stay_apart_that_no_pair_and_no_photograph_ties(
     graph = PairGraph.read(tmp_path / "database.db").without(between)
     parts = [part_of(truth, range(3)), part_of(truth, range(3, NUM_IMAGES))]
     assert len(joined_by_points(search_of(tmp_path, graph), parts)) == 2
+
+
+def test_a_model_without_an_image_of_its_own_is_left_as_it_is(
+    truth: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    graph = PairGraph.read(tmp_path / "database.db")
+    parts = [part_of(truth, range(4)), part_of(truth, range(1, 3))]
+    assert joined_by_points(search_of(tmp_path, graph), parts) == parts
