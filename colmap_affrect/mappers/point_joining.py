@@ -32,7 +32,6 @@ from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.tie_joining import MAX_SIM3_ERROR
 
 BY_POINTS = "joined by points of two models"  # in the words of a report
-NO_POINT = -1  # of a feature that sees none; pycolmap's
 
 
 def joined_by_points(
@@ -186,7 +185,7 @@ class PointJoiner:
         if not both:
             return np.zeros((0, 2), np.int64)
         together = np.concatenate(both)
-        is_seen = (together != NO_POINT).all(axis=1)
+        is_seen = (together >= 0).all(axis=1)
         return np.unique(together[is_seen], axis=0)
 
 

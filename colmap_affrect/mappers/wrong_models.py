@@ -22,7 +22,6 @@ from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     PoseById,
 )
-from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.regular_files import read_regular
@@ -53,9 +52,9 @@ class ThrownAway:
     stood_on: tuple[StoodOn, ...] = ()
     """Pairs that agreed with their models."""
 
-    def num_inliers(self) -> dict[Pair, int]:
+    def num_inliers(self) -> dict[tuple[str, str], int]:
         """Return the inliers of the pairs that models stood on, by both orders of the names."""
-        found = dict[Pair, int]()
+        found = dict[tuple[str, str], int]()
         for one in self.stood_on:
             found[one.first, one.second] = one.num_inliers
             found[one.second, one.first] = one.num_inliers
