@@ -22,6 +22,7 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.hypotheses import also_by
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     Ids,
@@ -295,12 +296,7 @@ def _map_without_false_pairs(
         found = mapper.map(other, output_path, seed, progress.show)
         if not found:
             return
-        judged.add([_named(WITHOUT_FALSE_PAIRS, mapped) for mapped in found])
-
-
-def _named(name: str, mapped: MappedModel) -> MappedModel:
-    """Return a model with the name of one more hypothesis that made it."""
-    return replace(mapped, hypotheses=(*mapped.hypotheses, name))
+        judged.add([also_by(WITHOUT_FALSE_PAIRS, mapped) for mapped in found])
 
 
 def _remove_unfinished(partial: Path) -> None:

@@ -16,6 +16,7 @@ from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
+from colmap_affrect.mappers.hypotheses import also_by, made_by
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
@@ -34,9 +35,8 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
 # What made a model, in the words of a report.
-MEASURED_PAIRS = (
-    "with the pairs of measured frames"  # others also verify sides that look the same
-)
+# Others also verify sides that look the same
+MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
@@ -45,9 +45,7 @@ COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
 NUM_COLMAP_MODELS = 2  # of COLMAP's, the largest, that are gone on from; resource
-FORWARD_MOTION = (
-    "mapper.init_max_forward_motion"  # option of pycolmap that users may give
-)
+FORWARD_MOTION = "mapper.init_max_forward_motion"  # of pycolmap; users may give it
 # Images from which on COLMAP's own pipeline maps: the search would take too long; resource
 MIN_LARGE_SET = 100
 
@@ -356,11 +354,11 @@ class _HypothesisTest:
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
             models = _of_some_tracks(self.search, graph) or self.search.best(graph)
-            return _made_by(hypothesis.name, models)
+            return made_by(hypothesis.name, models)
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
         models = self.search.extend_models(graph, self.best)
-        return [_also_by(hypothesis.name, mapped) for mapped in models]
+        return [also_by(hypothesis.name, mapped) for mapped in models]
 
     def _take(self, models: Sequence[MappedModel], score: float) -> None:
         self.best = list(models)
@@ -390,7 +388,7 @@ class _HypothesisTest:
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
-            self._take(_made_by(COLMAP_MODEL, found), score)
+            self._take(made_by(COLMAP_MODEL, found), score)
 
     def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
         """Go on with the cameras, and the optical axes, that models had."""
@@ -441,7 +439,7 @@ class _HypothesisTest:
         model = self.best[0].reconstruction
         changed = with_shifted_axes(model, free, search.graph)
         share = self._motion_share(self.best[0])
-        changed_model = _also_by(
+        changed_model = also_by(
             SHIFTED_AXES,
             replace(self.best[0], reconstruction=changed, motion_share=share),
         )
@@ -471,7 +469,7 @@ class _HypothesisTest:
         if score <= self.score + MIN_SCORE_GAIN:
             return
         share = self._motion_share(first)
-        changed = _also_by(
+        changed = also_by(
             PER_IMAGE_CAMERAS,
             replace(first, reconstruction=model, motion_share=share),
         )
@@ -504,24 +502,9 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _made_by(name: str, models: Sequence[MappedModel]) -> list[MappedModel]:
-    """Return models with the name of a hypothesis before those that each of them has."""
-    found = list[MappedModel]()
-    for mapped in models:
-        hypotheses = tuple(dict.fromkeys((name, *mapped.hypotheses)))
-        found.append(replace(mapped, hypotheses=hypotheses))
-    return found
-
-
-def _also_by(name: str, mapped: MappedModel) -> MappedModel:
-    """Return a model with the name of a hypothesis after those that it has."""
-    hypotheses = tuple(dict.fromkeys((*mapped.hypotheses, name)))
-    return replace(mapped, hypotheses=hypotheses)
-
-
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
     """Return models with the poses of previous ones, and all that their tracks now register."""
-    return with_new_images(_also_by(AGAIN, _remade(search, one)) for one in previous)
+    return with_new_images(also_by(AGAIN, _remade(search, one)) for one in previous)
 
 
 def _remade(search: Search, mapped: MappedModel) -> MappedModel:
