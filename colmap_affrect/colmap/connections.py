@@ -16,14 +16,33 @@ def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
 ) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
-    import networkx  # which takes as long to load as numpy and OpenCV together
+    partners = dict[T, list[T]]()
+    for image in images:
+        partners.setdefault(image, [])
+    for first, second in pairs:
+        partners.setdefault(first, []).append(second)
+        partners.setdefault(second, []).append(first)
+    parts = list[set[T]]()
+    known = set[T]()
+    for image in partners:
+        if image not in known:
+            part = _reached_from(image, partners)
+            known |= part
+            parts.append(part)
+    return sorted(parts, key=lambda part: (-len(part), min(part)))
 
-    graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
-    return sorted(
-        networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
-    )
+
+def _reached_from(image: T, partners: Mapping[T, Iterable[T]]) -> set[T]:
+    """Return an image and all that pairs connect with it."""
+    # networkx, which has this, takes as long to load as numpy and OpenCV together.
+    reached = {image}
+    waiting = [image]
+    for one in waiting:
+        for partner in partners[one]:
+            if partner not in reached:
+                reached.add(partner)
+                waiting.append(partner)
+    return reached
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
