@@ -43,12 +43,12 @@ POLL_S = 1.0
 TRANSFER_S = 60.0  # that a finished result may take to come here; resource
 # One that is being worked on and one that waits, so that no worker has to; resource
 TASKS_PER_THREAD = 2
-# That the tasks take that are sent at a time: some fifty times as long as sending them; resource
+# That tasks take that are sent at a time, some fifty times as long as sending them; resource
 BATCH_S = 0.5
-TINY_S = 1e-9  # seconds that are divided by; numeric
-MAX_GROWTH = (
-    4  # of their number from one time to the next: the first may be quick ones; judged
-)
+# Seconds that are divided by; numeric
+TINY_S = 1e-9
+# Of their number from one time to the next: the first may be quick ones; resource
+MAX_GROWTH = 4
 PACKAGES = (
     "colmap-affrect",
     "distributed",
@@ -133,6 +133,7 @@ class _Batches:
     """Puts tasks together that take about :data:`BATCH_S`, by what those before took."""
 
     def __init__(self) -> None:
+        """Begin with single tasks."""
         self.size = 1  # number of tasks of the next batch
         self._num_done = 0
         self._seconds = 0.0
@@ -146,7 +147,12 @@ class _Batches:
             batch = list(islice(waiting, self.size))
 
     def learn(self, num_tasks: int, seconds: float) -> None:
-        """Take into account how long tasks took."""
+        """Take into account how long tasks took.
+
+        Args:
+            num_tasks: of a batch.
+            seconds: that they took together.
+        """
         self._num_done += num_tasks
         self._seconds += seconds
         fitting = int(BATCH_S * self._num_done / max(self._seconds, TINY_S))
@@ -295,6 +301,7 @@ class Cluster:
         batches = _Batches()
 
         def results(sent: _Sent) -> Iterable[Any]:
+            """Wait for the results of a batch."""
             try:
                 done = self._result(sent.future)
             except Exception:
@@ -305,11 +312,12 @@ class Cluster:
             return list(done.results)
 
         def one_by_one(tasks: list[Task]) -> Iterator[Any]:
-            # What a task raises comes at its place, after the results before it.
+            """Yield results up to what a task raises, which so comes at its place."""
             for task in tasks:
                 yield from self._result(job.submit([task]).future).results
 
-        def num_batches() -> int:  # that may be on their way
+        def num_batches() -> int:
+            """Return how many may be on their way."""
             return TASKS_PER_THREAD * self._watch.num_threads()
 
         sent = in_order(
@@ -326,6 +334,13 @@ class _Job:
     def __init__(
         self, client: Client, function: Callable[[Any], Any], expected: dict[str, str]
     ) -> None:
+        """Pickle the function.
+
+        Args:
+            client: of the cluster.
+            function: does a task.
+            expected: what workers must have, as :func:`environment` names it.
+        """
         self._client = client
         self._job = pickle.dumps(function), tuple(expected.items())
         self._name = f"{type(function).__name__}-{uuid.uuid4().hex}"
