@@ -19,6 +19,7 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers.adjustment import MEDIUM
 from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
+    PrincipalPointPrior,
     has_free_center,
     shifted_principal_point,
     usual_principal_point,
@@ -82,11 +83,7 @@ def contradict_constant(
     num_observations = with_fewer_points(model).compute_num_observations()
     if not num_observations:
         return False
-    freed = set[int]()
-    for key in used_cameras(model):
-        prior = free.adjuster.priors[key]
-        if prior.principal_point and not constant.adjuster.priors[key].principal_point:
-            freed.add(key)
+    freed = _freed(model, constant, free).keys()
     per_parameter = 0.5 * math.log(num_observations)
     constant_cost = min(constant.costs_of_starts(model))
     crop_cost = min(free.costs_of_starts(model))
@@ -191,14 +188,35 @@ def _rotations(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rotation3d]
     return found
 
 
-def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
-    """Return how much the free principal points of a model cost, in nats."""
+def freed_principal_point_cost(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> float:
+    """Return how much those principal points cost that were freed, in nats.
+
+    Args:
+        model: With free principal points.
+        constant: The search in which they were constant.
+        free: The search that made the model.
+    """
     total = 0.0
-    for camera in used_cameras(model).values():
-        prior = search.adjuster.priors[camera.camera_id].principal_point
-        if prior:
-            total += prior.cost(camera.principal_point_x, camera.principal_point_y)
+    cameras = used_cameras(model)
+    for key, prior in _freed(model, constant, free).items():
+        camera = cameras[key]
+        total += prior.cost(camera.principal_point_x, camera.principal_point_y)
     return total
+
+
+def _freed(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> dict[int, PrincipalPointPrior]:
+    """Return the priors of the principal points that one search holds and the other frees."""
+    found = dict[int, PrincipalPointPrior]()
+    for key in used_cameras(model):
+        prior = free.adjuster.priors[key].principal_point
+        was_constant = constant.adjuster.priors[key].principal_point is None
+        if prior is not None and was_constant:
+            found[key] = prior
+    return found
 
 
 def _with_priors(search: Search, priors: Mapping[int, CameraPrior]) -> Search:
