@@ -84,11 +84,21 @@ def _block_tensors(image: GrayImage, derivative_sigma_px: float) -> Singles:
     # Kernel size 1 and scale 0.5 make central differences.
     gradient_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     gradient_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    products = np.dstack([gradient_x**2, gradient_y**2, gradient_x * gradient_y])
     height, width = image.shape
     bottom = -height % STEP_PX
     right = -width % STEP_PX
-    padded = np.pad(products, ((0, bottom), (0, right), (0, 0)), mode="edge")
     num_blocks = ((width + right) // STEP_PX, (height + bottom) // STEP_PX)
-    means = cv2.resize(padded, num_blocks, interpolation=cv2.INTER_AREA)
-    return np.asarray(means, dtype=np.float32)
+    means = np.empty((num_blocks[1], num_blocks[0], 3), np.float32)
+    factors = (
+        (gradient_x, gradient_x),
+        (gradient_y, gradient_y),
+        (gradient_x, gradient_y),
+    )
+    for channel, (first, second) in enumerate(factors):
+        padded = cv2.copyMakeBorder(
+            first * second, 0, bottom, 0, right, cv2.BORDER_REPLICATE
+        )
+        means[..., channel] = cv2.resize(
+            padded, num_blocks, interpolation=cv2.INTER_AREA
+        )
+    return means

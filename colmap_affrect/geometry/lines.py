@@ -16,6 +16,7 @@ camera looks along z. A shift is that of the principal point, down.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -144,7 +145,7 @@ class Lines:
     segments: Segments
     likelihood: LineLikelihood | None
 
-    @property
+    @cached_property
     def says_shifted(self) -> bool:
         """Whether the lines say that the optical axis is not in the middle of the image."""
         return (
@@ -248,12 +249,17 @@ def upright_of(rotation: Floats) -> Floats:
 
 def _log_joint(likelihood: LineLikelihood, shift_sigma: float) -> Floats:
     """Return (F, S) log-likelihoods with log-probabilities beforehand, which sum to one."""
+    prior, log_sum = _log_prior(shift_sigma)
+    return np.asarray(likelihood.log_likelihoods + prior - log_sum)
+
+
+@lru_cache(maxsize=8)
+def _log_prior(shift_sigma: float) -> tuple[Floats, float]:
+    """Return (F, S) log-probabilities beforehand up to a constant, and the log of their sum."""
     focal_prior = -0.5 * (np.log(FOCALS / USUAL_FOCAL) / USUAL_FOCAL_SIGMA) ** 2
     shift_prior = -0.5 * (SHIFTS / shift_sigma) ** 2
     prior = focal_prior[:, None] + shift_prior[None, :]
-    return np.asarray(
-        likelihood.log_likelihoods + prior - np.logaddexp.reduce(prior, axis=None)
-    )
+    return prior, float(np.logaddexp.reduce(prior, axis=None))
 
 
 def posterior(likelihood: LineLikelihood, shift_sigma: float) -> Floats:

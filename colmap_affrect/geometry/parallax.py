@@ -121,7 +121,7 @@ def _rotation_ratios(
     random = np.random.default_rng(0)
     samples = random.integers(len(points1), size=(NUM_STARTS, 2))
     starts = _rotations_of_two(rays1[:, samples], rays2[:, samples])
-    errors = np.empty(rays1.shape[:2])
+    best_starts = np.empty((len(lenses), 3, 3))
     # To compare starts half the digits do, in half the time.
     columns1_32 = columns1.astype(np.float32)
     points2_32 = points2.astype(np.float32)
@@ -134,26 +134,13 @@ def _rotation_ratios(
             points2=points2_32,
             focal2=float(focal2),
         )
-        best_start = _medians(start_errors).argmin()
-        errors[index] = _rotation_errors(
-            rotations=starts[index, best_start, None],
-            columns1=columns1[index],
-            points2=points2,
-            focal2=float(focal2),
-        )[0]
+        best_starts[index] = starts[index, _medians(start_errors).argmin()]
+    errors = _errors_of_lenses(best_starts, columns1, points2, focals2)
     for _ in range(MAX_ITERATIONS):
         limits = np.maximum(error, _medians(errors))
         is_inlier = errors <= limits[:, None]
         rotations = _fitted_rotations(rays1 * is_inlier[..., None], rays2)
-        for index, focal2 in enumerate(focals2):
-            rotation = rotations[index, None]
-            columns = columns1[index]
-            errors[index] = _rotation_errors(
-                rotations=rotation,
-                columns1=columns,
-                points2=points2,
-                focal2=focal2,
-            )[0]
+        errors = _errors_of_lenses(rotations, columns1, points2, focals2)
     return np.asarray((errors <= error).mean(axis=1))
 
 
@@ -171,6 +158,24 @@ def _rotation_errors(
     rows = rotations.reshape(-1, 3)  # one product is ten times as fast as many
     rotated = (rows @ columns1).reshape(*rotations.shape[:-1], -1)
     scales = focal2 / np.maximum(rotated[:, 2], MIN_DEPTH)
+    errors_x = rotated[:, 0] * scales - points2[:, 0]
+    errors_y = rotated[:, 1] * scales - points2[:, 1]
+    return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
+
+
+def _errors_of_lenses(
+    rotations: Floats, columns1: Floats, points2: Floats, focals2: Floats
+) -> Floats:
+    """Return (L, N) px between rotated rays and their matches, one rotation for each lens.
+
+    Args:
+        rotations: (L, 3, 3).
+        columns1: (L, 3, N) unit rays of the first image.
+        points2: (N, 2) px from the middle of the second image.
+        focals2: (L,) focal lengths of the second image in px.
+    """
+    rotated = rotations @ columns1
+    scales = focals2[:, None] / np.maximum(rotated[:, 2], MIN_DEPTH)
     errors_x = rotated[:, 0] * scales - points2[:, 0]
     errors_y = rotated[:, 1] * scales - points2[:, 1]
     return np.asarray(np.sqrt(errors_x**2 + errors_y**2))
@@ -355,21 +360,38 @@ def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -
     size1, size2 = sizes
     if not len(points1):
         return 0.0
-    height = size1[1] + 2 * MARGIN_PX
-    width = size1[0] + 2 * MARGIN_PX
-    is_keypoint = np.zeros((height, width), np.uint8)
-    in_first = points2 * np.divide(size1, size2)
-    is_keypoint[_pixels(in_first, size1)] = 1
-    is_near = np.asarray(cv2.dilate(is_keypoint, np.ones((3, 3), np.uint8)))
+    # One px more on each side, for neighbours of what is at the border
+    height = size1[1] + 2 * MARGIN_PX + 2
+    width = size1[0] + 2 * MARGIN_PX + 2
+    is_keypoint = np.zeros((height, width), np.bool_)
+    rows, columns = _pixels(points2 * np.divide(size1, size2), size1)
+    is_keypoint[rows + 1, columns + 1] = True
     ratios = [0.0]
     for axis in (0, 1):
         mirrored = _sampled(points1.astype(np.float64))
         mirrored[:, axis] = size1[axis] - mirrored[:, axis]
-        ratio = is_near[_pixels(mirrored, size1)].mean()
-        by_chance = is_near[_pixels(mirrored + DISPLACEMENT_PX, size1)].mean()
+        ratio = _are_near(mirrored, is_keypoint, size1).mean()
+        displaced = mirrored + DISPLACEMENT_PX
+        by_chance = _are_near(displaced, is_keypoint, size1).mean()
         free = max(1.0 - by_chance, MIN_FREE_RATIO)
         ratios.append(float((ratio - by_chance) / free))
     return max(ratios)
+
+
+def _are_near(points: Floats, is_keypoint: Bools, size: Size) -> Bools:
+    """Return which of (N, 2) points are in the pixel of a keypoint or in one beside it.
+
+    Args:
+        points: px in an image of (width, height).
+        is_keypoint: pixels of the image, with the margin and one px more on each side.
+        size: (width, height) px.
+    """
+    rows, columns = _pixels(points, size)
+    is_near = np.zeros(len(points), np.bool_)
+    for down in range(3):
+        for right in range(3):
+            is_near |= is_keypoint[rows + down, columns + right]
+    return is_near
 
 
 def _pixels(points: Floats, size: Size) -> tuple[Indices, Indices]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from colmap_affrect.geometry.affine import determinants
-from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
 
 # Dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
 STEP_PX = 4
@@ -37,6 +37,8 @@ GRID_NUM_ANGLES = 32  # candidates of each tilt (the paper)
 NEAR_OPTIMAL_RINGS = ((2.61757, 0.398032, 8), (5.18168, 0.198314, 16))
 """Tilts, steps of the angle in radians and numbers of maps (Rodriguez, Delon, Morel 2018, constants
 for r = 1.7); paper."""
+# Metrics whose distances to all centres are held at once, which stay in the cache; resource
+NUM_AT_ONCE = 4096
 IDENTITY_LABEL = -1  # format
 UNCOVERED_LABEL = -2  # format
 
@@ -220,7 +222,7 @@ def cover_shapes(
     voters = np.flatnonzero(votes)
     votes = votes[voters].astype(np.float32)
     candidate_metrics = metrics_from_tilts(candidates[:, 0], candidates[:, 1])
-    in_ball = cosh_distances(candidate_metrics, metrics[voters]) < threshold
+    in_ball = _in_balls(candidate_metrics, metrics[voters], threshold)
     ballots = in_ball.astype(np.float32)
     chosen: list[int] = []
     while votes.sum() > max_uncovered and len(chosen) < max_num_centers:
@@ -232,6 +234,25 @@ def cover_shapes(
         votes = np.where(in_ball[best], np.float32(0), votes)
     centers = np.asarray(candidates[chosen], dtype=np.float64)
     return Cover(centers, nearest_centers(metrics, centers, radius))
+
+
+def _in_balls(centers: Floats, metrics: Floats, threshold: float) -> Bools:
+    """Return which metrics are in the balls of centres.
+
+    Args:
+        centers: (K, 3) metrics.
+        metrics: (N, 3).
+        threshold: as :func:`ball_threshold` has it.
+
+    Returns:
+        (K, N) bool.
+    """
+    in_ball = np.empty((len(centers), len(metrics)), np.bool_)
+    for begin in range(0, len(metrics), NUM_AT_ONCE):
+        part = slice(begin, begin + NUM_AT_ONCE)
+        distances = cosh_distances(centers, metrics[part])
+        np.less(distances, threshold, out=in_ball[:, part])
+    return in_ball
 
 
 def nearest_centers(

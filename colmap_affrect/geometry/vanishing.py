@@ -67,13 +67,16 @@ class VanishingFit:
         densities[:, 3] = CHANCE_DENSITY
         self.densities = densities  # (K, 4, N) of the three directions and of chance
         self.shares = self._estimated_shares()
+        self.likelihoods = self._likelihoods(self.shares)  # (K, N) of the segments
 
     def _vanishing_points(self, directions: Floats) -> Floats:
         """Return the (K, 3, 3) homogeneous points in which directions vanish."""
-        x, y, z = np.moveaxis(directions, -1, 0)
         focals = self.focals[:, None]
-        shifts = self.shifts[:, None]
-        return np.stack([focals * x, focals * y + shifts * z, z], axis=-1)
+        z = directions[..., 2]
+        points = directions * focals[..., None]
+        points[..., 1] += self.shifts[:, None] * z
+        points[..., 2] = z
+        return np.asarray(points)
 
     def _distances(self, points: Floats) -> Floats:
         """Return the (K, 3, N) lengths of the vectors from middles to homogeneous points."""
@@ -92,7 +95,9 @@ class VanishingFit:
 
     def _crossed(self, points: Floats) -> Floats:
         """Return the (K, 3, N) cross products of these vectors with the directions of segments."""
-        return np.asarray(points @ self.segments.lines.T)
+        # One product of all cameras: many small ones take longer.
+        crossed = points.reshape(-1, 3) @ self.segments.lines.T
+        return np.asarray(crossed.reshape(*points.shape[:-1], -1))
 
     def _estimated_shares(self) -> Floats:
         """Return the (K, 4) shares of the kinds of segments, by a few steps of EM."""
@@ -111,7 +116,7 @@ class VanishingFit:
 
     def scores(self) -> Floats:
         """Return (K,) log-likelihood ratios against chance alone."""
-        ratios = self._likelihoods(self.shares) / CHANCE_DENSITY
+        ratios = self.likelihoods / CHANCE_DENSITY
         return np.asarray(np.log(ratios) @ self.segments.weights)
 
     def improved(self) -> Floats:
@@ -120,9 +125,7 @@ class VanishingFit:
         It holds the distances to the vanishing points, as a small turn hardly changes them.
         """
         segments = self.segments
-        portions = (
-            segments.weights / segments.sigmas**2 / self._likelihoods(self.shares)
-        )
+        portions = segments.weights / segments.sigmas**2 / self.likelihoods
         parts = self.densities[:, :3] * self.shares[:, :3, None] * portions[:, None, :]
         num_cameras = len(self.focals)
         slopes = np.empty((num_cameras, 3, *self.sines.shape[1:]))

@@ -192,8 +192,11 @@ def _distinctive_rows(
     best_cosines = cosines[np.arange(len(best)), best]
     rows = np.flatnonzero(best_cosines > options.min_cosine)
     other_cosines = cosines[rows]
-    nearest_points = points2[best[rows]]
-    distances = np.linalg.norm(nearest_points[:, None] - points2, axis=2)
+    x, y = points2.T
+    nearest = best[rows]
+    distances = (x[nearest, None] - x) ** 2
+    distances += (y[nearest, None] - y) ** 2
+    np.sqrt(distances, out=distances)
     other_cosines[distances <= options.min_contrast_distance_px] = SECOND_IS_OPPOSITE
     ratios = distance_ratios(best_cosines[rows], other_cosines.max(axis=1))
     return np.asarray(rows[ratios < options.max_ratio])
@@ -248,10 +251,17 @@ def _groups_near_positions(
     points1, points2 = model.points
     with np.errstate(divide="ignore", invalid="ignore"):
         positions = project(model.matrix, points1)
+    x2, y2 = np.ascontiguousarray(points2.T)
+    # In the same memory for all groups: making and leaving it takes longer than the sums.
+    squares_x = np.empty((GROUP_SIZE, len(points2)))
+    squares_y = np.empty_like(squares_x)
     for group in _groups_by(positions[:, 1]):
-        x = positions[group, 0, None] - points2[:, 0]
-        y = positions[group, 1, None] - points2[:, 1]
-        yield group, x**2 + y**2 <= radius_px**2
+        x = np.subtract(positions[group, 0, None], x2, out=squares_x[: len(group)])
+        y = np.subtract(positions[group, 1, None], y2, out=squares_y[: len(group)])
+        x *= x
+        y *= y
+        x += y
+        yield group, x <= radius_px**2
 
 
 def _groups_near_lines(
@@ -266,10 +276,17 @@ def _groups_near_lines(
     _, singular_values, axes = np.linalg.svd(model.fundamental)
     coordinates = homogeneous(points1) @ axes[:2].T * singular_values[:2]
     pencil_angles = np.arctan2(coordinates[:, 0], coordinates[:, 1]) % np.pi
+    columns2 = np.ascontiguousarray(homogeneous2.T)
+    # In the same memory for all groups: making and leaving it takes longer than the sums.
+    all_limits = np.empty((GROUP_SIZE, len(points2)))
+    all_products = np.empty_like(all_limits)
     for group in _groups_by(pencil_angles):
-        squares = squares2[group, None] + squares1
-        products = lines2[group] @ homogeneous2.T
-        yield group, products**2 <= band_px**2 * squares
+        limits = all_limits[: len(group)]
+        np.add(squares2[group, None], squares1, out=limits)
+        limits *= band_px**2
+        products = np.matmul(lines2[group], columns2, out=all_products[: len(group)])
+        products *= products
+        yield group, products <= limits
 
 
 def _groups_by(values: Array) -> list[Indices]:

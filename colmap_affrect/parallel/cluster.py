@@ -1,8 +1,9 @@
 """Work on an existing dask.distributed cluster (the only user of distributed).
 
 The workers compute and send results back; only this process writes. Tasks of a lost worker are
-done again by others. A worker has as many tasks at a time as it has threads, each on one core. Its
-results are the same as here, because it must have the same versions of the packages that compute.
+done again by others. A worker has as many tasks at a time as it has threads, each on one core.
+Short tasks are sent several at a time: sending takes as long as a short one. Results are the same
+as here, because a worker must have the same versions of the packages that compute.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ import pickle
 import platform
 import re
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +43,12 @@ POLL_S = 1.0
 TRANSFER_S = 60.0  # that a finished result may take to come here; resource
 # One that is being worked on and one that waits, so that no worker has to; resource
 TASKS_PER_THREAD = 2
+# That tasks take that are sent at a time, some fifty times as long as sending them; resource
+BATCH_S = 0.5
+# Seconds that are divided by; numeric
+TINY_S = 1e-9
+# Of their number from one time to the next: the first may be quick ones; resource
+MAX_GROWTH = 4
 PACKAGES = (
     "colmap-affrect",
     "distributed",
@@ -103,11 +112,63 @@ def _function(
     return function
 
 
-def _work(pickled: bytes, expected: tuple[tuple[str, str], ...], task: bytes) -> Any:
-    """Do one task on a worker that has what is expected, by a pickled function."""
+@dataclass(frozen=True)
+class _Done:
+    """What a worker sends back of a batch."""
+
+    results: list[Any]  # of its tasks, in their order
+    seconds: float  # that they took
+
+
+def _work(pickled: bytes, expected: tuple[tuple[str, str], ...], tasks: bytes) -> _Done:
+    """Do a batch of tasks on a worker that has what is expected, by a pickled function."""
     with _loading:
         function = _function(pickled, expected)
-    return function(pickle.loads(task))  # noqa: S301 - from the driver
+    start = time.perf_counter()
+    results = [function(task) for task in pickle.loads(tasks)]  # noqa: S301 - from the driver
+    return _Done(results, time.perf_counter() - start)
+
+
+class _Batches:
+    """Puts tasks together that take about :data:`BATCH_S`, by what those before took."""
+
+    def __init__(self) -> None:
+        """Begin with single tasks."""
+        self.size = 1  # number of tasks of the next batch
+        self._num_done = 0
+        self._seconds = 0.0
+
+    def of(self, tasks: Iterable[Task]) -> Iterator[list[Task]]:
+        """Yield tasks in their order, each batch when its turn comes."""
+        waiting = iter(tasks)
+        batch = list(islice(waiting, self.size))
+        while batch:
+            yield batch
+            batch = list(islice(waiting, self.size))
+
+    def learn(self, num_tasks: int, seconds: float) -> None:
+        """Take into account how long tasks took.
+
+        Args:
+            num_tasks: of a batch.
+            seconds: that they took together.
+        """
+        self._num_done += num_tasks
+        self._seconds += seconds
+        fitting = int(BATCH_S * self._num_done / max(self._seconds, TINY_S))
+        self.size = max(1, min(fitting, MAX_GROWTH * self.size))
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """A batch on its way."""
+
+    tasks: list[Any]
+    future: Future
+
+    def cancel(self) -> None:
+        """Have it not done, if it has not begun."""
+        self.future.cancel()
 
 
 @contextmanager
@@ -235,44 +296,91 @@ class Cluster:
                 with one task, or a worker differs or does not see the files.
             Exception: what the function raises, at the place of its task.
         """
-        from distributed import KilledWorker
-
         expected = environment(str(path) for path in files)
-        job = pickle.dumps(function), tuple(expected.items())
-        name = f"{type(function).__name__}-{uuid.uuid4().hex}"
-        numbers = count()
+        job = _Job(self._client, function, expected)
+        batches = _Batches()
 
-        def submit(task: Task) -> Future:
-            key = f"{name}-{next(numbers)}"
-            return self._client.submit(
-                _work, *job, pickle.dumps(task), key=key, pure=False
-            )
+        def results(sent: _Sent) -> Iterable[Any]:
+            """Wait for the results of a batch."""
+            try:
+                done = self._result(sent.future)
+            except Exception:
+                if len(sent.tasks) == 1 or sent.future.status != "error":
+                    raise
+                return one_by_one(sent.tasks)
+            batches.learn(len(done.results), done.seconds)
+            return list(done.results)
 
-        def num_tasks() -> int:  # that may be on their way
+        def one_by_one(tasks: list[Task]) -> Iterator[Any]:
+            """Yield results up to what a task raises, which so comes at its place."""
+            for task in tasks:
+                yield from self._result(job.submit([task]).future).results
+
+        def num_batches() -> int:
+            """Return how many may be on their way."""
             return TASKS_PER_THREAD * self._watch.num_threads()
 
-        try:
-            yield from in_order(submit, tasks, limit=num_tasks, result=self._result)
-        except KilledWorker as error:
-            raise AffrectError(
-                f"{error.allowed_failures + 1} workers were lost while working on one "
-                "task, for want of memory perhaps",
-                where=self._address,
-                advice="run the same command again",
-            ) from error
-        except CancelledError as error:
-            raise AffrectError(
-                "the scheduler was lost",
-                where=self._address,
-                advice="start it and run the same command again",
-            ) from error
-        except (ModuleNotFoundError, RuntimeError) as error:
-            why = error.__cause__ or error
-            if not isinstance(why, ModuleNotFoundError):
-                raise
-            raise AffrectError(
-                "scheduler or workers do not have this version of colmap-affrect "
-                f"({why})",
-                where=self._address,
-                advice="install it on all machines of the cluster",
-            ) from error
+        sent = in_order(
+            job.submit, batches.of(tasks), limit=num_batches, result=results
+        )
+        with _lost_cluster_told(self._address), closing(sent):
+            for found in sent:
+                yield from found
+
+
+class _Job:
+    """Sends batches of the tasks of one function to a cluster."""
+
+    def __init__(
+        self, client: Client, function: Callable[[Any], Any], expected: dict[str, str]
+    ) -> None:
+        """Pickle the function.
+
+        Args:
+            client: of the cluster.
+            function: does a task.
+            expected: what workers must have, as :func:`environment` names it.
+        """
+        self._client = client
+        self._job = pickle.dumps(function), tuple(expected.items())
+        self._name = f"{type(function).__name__}-{uuid.uuid4().hex}"
+        self._numbers = count()
+
+    def submit(self, batch: list[Any]) -> _Sent:
+        """Send a batch."""
+        key = f"{self._name}-{next(self._numbers)}"
+        future = self._client.submit(
+            _work, *self._job, pickle.dumps(batch), key=key, pure=False
+        )
+        return _Sent(batch, future)
+
+
+@contextmanager
+def _lost_cluster_told(address: str) -> Iterator[None]:
+    """Make one line of what distributed raises where a cluster is lost or is another one."""
+    from distributed import KilledWorker
+
+    try:
+        yield
+    except KilledWorker as error:
+        raise AffrectError(
+            f"{error.allowed_failures + 1} workers were lost while working on one "
+            "task, for want of memory perhaps",
+            where=address,
+            advice="run the same command again",
+        ) from error
+    except CancelledError as error:
+        raise AffrectError(
+            "the scheduler was lost",
+            where=address,
+            advice="start it and run the same command again",
+        ) from error
+    except (ModuleNotFoundError, RuntimeError) as error:
+        why = error.__cause__ or error
+        if not isinstance(why, ModuleNotFoundError):
+            raise
+        raise AffrectError(
+            f"scheduler or workers do not have this version of colmap-affrect ({why})",
+            where=address,
+            advice="install it on all machines of the cluster",
+        ) from error

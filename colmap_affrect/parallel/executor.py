@@ -8,7 +8,7 @@ import ctypes
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -166,7 +166,7 @@ def in_order(
     tasks: Iterable[Task],
     limit: Callable[[], int],
     result: Callable[[Any], Any] = _result,
-) -> Iterator[Any]:
+) -> Generator[Any, None, None]:
     """Yield results of futures in task order.
 
     What has not ended is cancelled when the iteration ends early.

@@ -275,6 +275,10 @@ class FeatureStore(GroupStore):
         """Read the (N, 2, 3) frames of one image."""
         return self._values(name, "lafs")
 
+    def read_rectification_ids(self, name: str) -> Indices:
+        """Read the (N,) warps that the features of one image come from; 0 is the image itself."""
+        return self._values(name, "rectification_ids")
+
     def _values(self, name: str, dataset: str) -> NDArray[Any]:
         with self._open("r") as file:
             return read_checked(self._group(file, name), dataset)

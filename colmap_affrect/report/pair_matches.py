@@ -133,7 +133,7 @@ class PairReader:
         """Return the kinds of the features of a photograph; none where the run has none."""
         if not self.run:
             return np.empty(0, dtype=np.int64)
-        ids = self.run.features.read(name).rectification_ids
+        ids = self.run.features.read_rectification_ids(name)
         kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
         for level, rows in self.run.features.level_ranges(name).items():
             if not self.run.extraction.levels[level].features.has_shapes:

@@ -10,7 +10,11 @@ from strategies import Array
 from synthetic import texture
 
 from colmap_affrect.data import GrayImage, ShapeGrid
-from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import (
+    SecondMoment,
+    SecondMomentOptions,
+    _block_tensors,
+)
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.tilts import STEP_PX, tilts_from_metrics
 
@@ -89,3 +93,18 @@ def test_a_slope_of_less_than_one_gray_value_a_pixel_is_no_texture(
     grid = SOURCE.grid(np.tile(row, (64, 1)))
     assert bool(grid.textured[4:-4, 4:-4].all()) == has_texture
     assert bool(grid.textured[4:-4, 4:-4].any()) == has_texture
+
+
+def test_block_tensors_are_means_of_products_of_gradients() -> None:
+    random = np.random.default_rng(0)
+    image = random.integers(0, 256, (18, 21), dtype=np.uint8)  # no whole blocks
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
+    framed = np.pad(smooth, 1, mode="reflect")
+    gradient_x = (framed[1:-1, 2:] - framed[1:-1, :-2]) / 2.0
+    gradient_y = (framed[2:, 1:-1] - framed[:-2, 1:-1]) / 2.0
+    products = [gradient_x**2, gradient_y**2, gradient_x * gradient_y]
+    padded = np.pad(np.stack(products, axis=-1), ((0, 2), (0, 3), (0, 0)), mode="edge")
+    blocks = padded.reshape(5, 4, 6, 4, 3).mean(axis=(1, 3))
+    found = _block_tensors(image, 1.5)
+    assert found.dtype == np.float32
+    assert_allclose(found, blocks, rtol=1e-4, atol=1e-3)

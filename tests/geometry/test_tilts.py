@@ -19,7 +19,9 @@ from strategies import (
 
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
+    NUM_AT_ONCE,
     UNCOVERED_LABEL,
+    _in_balls,
     are_individual_shapes,
     ball_threshold,
     cosh_distances,
@@ -224,3 +226,16 @@ def test_most_shapes_that_were_measured_one_by_one_differ(
     # Steps of 3e-4 of shapes of unit area.
     shapes[:num_measured, 1, 0] = 3e-4 * np.arange(num_measured)
     assert are_individual_shapes(shapes) == expected
+
+
+def test_blocks_of_metrics_change_no_ball() -> None:
+    random = np.random.default_rng(0)
+    num = 2 * NUM_AT_ONCE + 5
+    metrics = metrics_from_tilts(
+        random.uniform(1.0, 6.0, num), random.uniform(0.0, np.pi, num)
+    )
+    centers = metrics_from_tilts(*covering_grid().T)
+    threshold = ball_threshold(1.7)
+    in_ball = _in_balls(centers, metrics, threshold)
+    assert 0 < in_ball[:, -5:].sum() < in_ball[:, -5:].size
+    np.testing.assert_array_equal(in_ball, cosh_distances(centers, metrics) < threshold)

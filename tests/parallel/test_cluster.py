@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -29,6 +30,7 @@ from colmap_affrect.parallel import cluster as cluster_module
 from colmap_affrect.parallel import cluster_watch
 from colmap_affrect.parallel.cluster import (
     Cluster,
+    _Batches,
     connected,
     environment,
     require_environment,
@@ -199,6 +201,40 @@ def test_cluster_that_is_lost_ends_the_run_in_one_line(
             work()
         assert 3 <= found < 10
         assert time.monotonic() - start < 60
+
+
+def test_short_tasks_are_sent_together_and_an_error_comes_at_its_place(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = list[object]()
+    with connected(address) as cluster:
+        submit = cluster._client.submit
+
+        def counted(*arguments: Any, **keywords: Any) -> Any:
+            sent.append(keywords)
+            return submit(*arguments, **keywords)
+
+        monkeypatch.setattr(cluster._client, "submit", counted)
+        numbers = list(map(str, range(300)))
+        assert list(cluster.map(int, numbers)) == list(range(300))
+        assert len(sent) < 60
+        results = cluster.map(int, [*numbers, "no number", *numbers])
+        assert [next(results) for _ in numbers] == list(range(300))
+        with pytest.raises(ValueError, match="no number"):
+            next(results)
+
+
+def test_batches_take_about_half_a_second() -> None:
+    batches = _Batches()
+    sizes = []
+    for batch in batches.of(range(300)):
+        sizes.append(len(batch))
+        batches.learn(len(batch), len(batch) / 128)
+    assert sizes == [1, 4, 16, 64, 64, 64, 64, 23]
+    batches.learn(1, 30.0)
+    assert batches.size == 4
+    batches.learn(9, 1000.0)
+    assert batches.size == 1
 
 
 def test_files_that_workers_do_not_see_are_named(photos: Path, address: str) -> None:

@@ -24,6 +24,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import OptionError
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
@@ -129,8 +130,8 @@ class Stores(SimpleNamespace):
             matches=self,
         )
 
-    def read(self, name: str) -> Any:
-        return SimpleNamespace(rectification_ids=np.arange(self.counts[name]) % 2)
+    def read_rectification_ids(self, name: str) -> Indices:
+        return np.arange(self.counts[name]) % 2
 
     def level_ranges(self, _: str) -> dict[int, range]:
         return {0: range(60), 1: range(60, 1000)}
