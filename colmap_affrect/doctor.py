@@ -21,7 +21,6 @@ from colmap_affrect.colmap.model_files import has_model, model_folder, read_give
 from colmap_affrect.colmap.tables import NoDatabaseError
 from colmap_affrect.errors import (
     AffrectError,
-    DatabaseError,
     Option,
     OptionError,
     WorkspaceError,
@@ -45,6 +44,7 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5  # display
 # Problems of databases that may be of use to COLMAP
 HARMLESS = WARNED | {"camera-panorama"}
+WRITABLE = "make it writable before running anything in it"
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -198,7 +198,7 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     except NoDatabaseError as error:
         _add_error(diagnosis, path, error, advice or "give a database")
         return False
-    except DatabaseError as error:
+    except AffrectError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
         _add_error(
             diagnosis, path, error, advice or with_flags(error.advice) or recover
@@ -249,9 +249,13 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
             stack.enter_context(workspace.locked())
         except (WorkspaceError, OptionError) as error:
             in_use = isinstance(error.__cause__, TimeoutError)
-            writable = "make it writable before running anything in it"
-            advice = "run doctor again when it is done" if in_use else writable
-            diagnosis.add("warning", path, _fault_of(error, path), advice)
+            advice = with_flags(error.advice)
+            severity: Severity = "warning"
+            if in_use:
+                advice = "run doctor again when it is done"
+            elif isinstance(error, OptionError):
+                severity = "error"  # no command works in it
+            diagnosis.add(severity, path, _fault_of(error, path), advice or WRITABLE)
             if in_use:
                 return
         _OutputFolder(diagnosis, workspace).examine()
@@ -310,6 +314,8 @@ class _OutputFolder:
             self._examine_stores(context)
         if "extract" in done:
             self._require(workspace.features)
+            if "match" in done:
+                self._require(workspace.matches)
             self._examine_pairs(context, are_listed="match" in done)
         if done:
             self._require(workspace.database)
