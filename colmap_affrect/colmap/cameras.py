@@ -175,6 +175,13 @@ class GivenCamera(Options):
         """The same of any image: equal where the same is said."""
         return self.changed(name="", camera="", where=Row("", ""))
 
+    @property
+    def mean_focal_px(self) -> float:
+        """Focal length that its parameters say, the mean of two; it has some."""
+        like = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1)
+        like.params = list(self.params)
+        return float(like.mean_focal_length())
+
     @pydantic.model_validator(mode="after")
     def _says_all_once(self) -> Self:
         if self.params and (self.focal_px or self.focal_mm or self.cx is not None):

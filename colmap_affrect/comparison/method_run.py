@@ -279,8 +279,7 @@ class MethodRun:
                 failures = self._match_recipe(watch)
             else:
                 failures = self._match_sift(watch)
-            texts = {name: why.text() for name, why in failures.items()}
-            self.keep(failures=texts, wall_s=watch.seconds)
+            self.keep(failed_images=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
             if seed not in done:

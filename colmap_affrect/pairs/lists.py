@@ -247,14 +247,14 @@ def _lines(file: TextIO) -> Iterator[str]:
     line = file.readline(LONGEST_LINE + 1)
     while line:
         is_long = len(line) > LONGEST_LINE and not line.endswith("\n")
-        says_nothing = is_rest or not line.strip() or line.lstrip().startswith("#")
-        if not says_nothing:
+        says_nothing = not line.strip() or line.lstrip().startswith("#")
+        if not is_rest and (not is_long or not says_nothing):
             yield line
             if is_long:
                 return
         elif not is_long:
             yield "\n"
-        is_rest = says_nothing and is_long
+        is_rest = is_long
         line = file.readline(LONGEST_LINE + 1)
 
 

@@ -12,7 +12,11 @@ from typing import Any
 from colmap_affrect.errors import such_as
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
-from colmap_affrect.project.image_failures import ImageFailure
+from colmap_affrect.project.image_failures import (
+    ImageFailure,
+    failures_to_mapping,
+    texts_of_failures,
+)
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
 from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
@@ -147,7 +151,7 @@ class StageReport(Summarized):
     @property
     def failures(self) -> dict[str, str]:
         """Why images cannot be used, in words, by their names."""
-        return {name: why.text() for name, why in self.failed.items()}
+        return texts_of_failures(self.failed)
 
     @property
     def warnings(self) -> dict[str, str]:
@@ -156,7 +160,7 @@ class StageReport(Summarized):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
-        failed = {name: why.to_mapping() for name, why in self.failed.items()}
+        failed = failures_to_mapping(self.failed)
         warned = [warning.to_mapping() for warning in self.warned]
         in_words = {"failures": self.failures, "warnings": self.warnings}
         return {**asdict(self), **in_words, "failed": failed, "warned": warned}
