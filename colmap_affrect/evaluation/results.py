@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
+from colmap_affrect.errors import with_flags
 from colmap_affrect.evaluation.truths import PairResult
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.image_failures import (
@@ -75,7 +76,7 @@ class Evaluation(Summarized):
         values = json.loads(TypeAdapter(Evaluation).dump_json(self))
         recipes = {}
         for recipe, written in zip(self.recipes, values["recipes"], strict=True):
-            written["failures"] = recipe.failures
+            written["failures"] = texts_of_failures(recipe.failed, with_flags)
             written["failed"] = failures_to_mapping(recipe.failed)
             recipes[written.pop("name")] = written
         values["recipes"] = recipes

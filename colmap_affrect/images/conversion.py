@@ -69,7 +69,7 @@ class ConversionReport(Summarized):
             f"{len(self.copied)} copied",
             *[f"{new}: instead of {old}" for old, new in self.renamed.items()],
             *[f"{name}: {why}" for name, why in self.left_out.items()],
-            *[f"not {name}: {why}" for name, why in self.failures.items()],
+            *[f"not {name}: {why.text()}" for name, why in self.failed.items()],
         ]
         return "\n".join(lines)
 
@@ -124,7 +124,7 @@ def convert_images(
         if not (report.written or report.copied):
             raise ImageError(
                 f"none of {len(names)} files can be converted; the first: "
-                f"{report.failures[names[0]]}",
+                f"{report.failed[names[0]].text()}",
                 where=image_path,
             )
     return report

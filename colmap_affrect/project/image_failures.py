@@ -1,6 +1,6 @@
 """Why a photograph cannot be used: codes with values, and the one place that says them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +10,7 @@ from colmap_affrect.errors import (
     AffrectError,
     ImageError,
     Words,
+    with_arguments,
     with_flags,
 )
 from colmap_affrect.options import documented
@@ -109,9 +110,14 @@ class ImageFailure:
             return HEIC_ADVICE
         return ADVICE.get(self.code, "")
 
+    @property
+    def words(self) -> Words:
+        """All that is said of it."""
+        return UnusableImageError(self).words
+
     def text(self) -> str:
-        """Return all of it in words, in one line."""
-        return with_flags(UnusableImageError(self).words)
+        """Return all of it in one line, to who gives commands."""
+        return with_flags(self.words)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
@@ -140,9 +146,16 @@ def failure_of(error: AffrectError) -> ImageFailure:
     )
 
 
-def texts_of_failures(failed: Mapping[str, ImageFailure]) -> dict[str, str]:
-    """Return why photographs cannot be used, in words, by their names."""
-    return {name: why.text() for name, why in failed.items()}
+def texts_of_failures(
+    failed: Mapping[str, ImageFailure], said: Callable[[Words], str] = with_arguments
+) -> dict[str, str]:
+    """Return why photographs cannot be used, in words, by their names.
+
+    Args:
+        failed: why, by name.
+        said: what options are called: :func:`with_arguments`, or :func:`with_flags`.
+    """
+    return {name: said(why.words) for name, why in failed.items()}
 
 
 def failures_to_mapping(failed: Mapping[str, ImageFailure]) -> dict[str, Any]:

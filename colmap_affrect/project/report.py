@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import such_as, with_arguments, with_flags
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.image_failures import (
@@ -156,13 +156,16 @@ class StageReport(Summarized):
     @property
     def warnings(self) -> dict[str, str]:
         """What went less well than asked for, in words, by what it is about."""
-        return texts_by_subject(self.warned)
+        return texts_by_subject(self.warned, with_arguments)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
         failed = failures_to_mapping(self.failed)
         warned = [warning.to_mapping() for warning in self.warned]
-        in_words = {"failures": self.failures, "warnings": self.warnings}
+        in_words = {
+            "failures": texts_of_failures(self.failed, with_flags),
+            "warnings": texts_by_subject(self.warned),
+        }
         return {**asdict(self), **in_words, "failed": failed, "warned": warned}
 
     def summary(self) -> str:
@@ -476,7 +479,7 @@ class ReconstructionReport(Summarized):
             *self._preset_lines(),
         ]
         if with_warnings:
-            warnings = self.warnings.items()
+            warnings = self.warnings_with_flags().items()
             lines += _some(f"warning     {name}: {why}" for name, why in warnings)
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines.append(f"seconds     {seconds}")
@@ -484,6 +487,13 @@ class ReconstructionReport(Summarized):
             texts = filter(None, (advice.why, advice.command))
             lines.append("try         " + "\n            ".join(texts))
         return "\n".join(lines)
+
+    def warnings_with_flags(self) -> dict[str, str]:
+        """Return the warnings as pages and the terminal show them."""
+        found = dict[str, str]()
+        for stage in self.stages:
+            found.update(texts_by_subject(stage.warned))
+        return found
 
     def _extension_lines(self) -> list[str]:
         if not self.extended:

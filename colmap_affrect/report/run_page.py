@@ -161,7 +161,9 @@ def _content(
             contradiction_text(one) for one in report.focal_contradictions
         ],
         "doubts": _doubts(report, model),
-        "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
+        "notes": [
+            f"{name}: {why}" for name, why in report.warnings_with_flags().items()
+        ],
         "max_num_lines": MAX_LINES,
         "cards": [_card(name, report, photographs[name]) for name in names],
         "pairs_to_check": content.pairs_to_check,
@@ -196,8 +198,9 @@ def _card(name: str, report: RunReport, photograph: PhotographReport) -> Card:
     if photograph.model is None:
         why = report.unregistered.get(name)
         text = why.text() if why else FATES["not_registered"]
-        if name in report.failures:
-            text += f": {report.failures[name]}"
+        for stage in report.stages:
+            if name in stage.failed:
+                text += f": {stage.failed[name].text()}"
         return Card(name, "missing", text, ("all", "missing"))
     model = report.models[photograph.model]
     texts = [str(kind)]
