@@ -1,5 +1,6 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
+import itertools
 import json
 import math
 import platform
@@ -490,10 +491,8 @@ class ReconstructionReport(Summarized):
 
     def warnings_with_flags(self) -> dict[str, str]:
         """Return the warnings as pages and the terminal show them."""
-        found = dict[str, str]()
-        for stage in self.stages:
-            found.update(texts_by_subject(stage.warned))
-        return found
+        of_stages = (stage.warned for stage in self.stages)
+        return texts_by_subject(itertools.chain.from_iterable(of_stages))
 
     def _extension_lines(self) -> list[str]:
         if not self.extended:
