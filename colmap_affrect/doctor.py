@@ -317,7 +317,7 @@ class _OutputFolder:
             if "match" in done:
                 self._require(workspace.matches)
             self._examine_pairs(context, are_listed="match" in done)
-        if done:
+        if not {"copy", "verify"}.isdisjoint(done):  # else the next stage makes it
             self._require(workspace.database)
         if not workspace.database.exists():
             return

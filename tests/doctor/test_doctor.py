@@ -25,6 +25,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Finding, diagnose
 from colmap_affrect.errors import OptionError
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.pipeline.single_stages import choose_pairs
 from colmap_affrect.project.record import ModelInputs
 from colmap_affrect.project.workspace import Workspace
 
@@ -243,6 +244,13 @@ def test_array_of_an_absurd_size_is_damage_and_no_lack_of_memory(
     assert found.where == str(folders.out / store)
     assert f"damaged ({name[1:]} of shape {shape}" in found.what
     assert "'" in found.advice  # names a command that makes it again
+
+
+def test_stages_that_are_to_be_done_again_are_no_fault(folders: Folders) -> None:
+    assert folders.database.exists()
+    choose_pairs(folders.out, overwrite=True)
+    assert not folders.database.exists()
+    assert findings(folders.out) == []
 
 
 def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
