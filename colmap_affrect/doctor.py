@@ -8,7 +8,7 @@ import dataclasses
 import json
 import shlex
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,11 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
-from colmap_affrect.colmap.tables import NoDatabaseError
+from colmap_affrect.colmap.tables import (
+    NoDatabaseError,
+    open_read_only,
+    read_tables,
+)
 from colmap_affrect.errors import (
     AffrectError,
     Option,
@@ -325,8 +329,30 @@ class _OutputFolder:
         if done and not workspace.users_database:
             advice = f"remove it and {SAME_RUN}: it is made anew"
         is_usable = examine_database(self.diagnosis, workspace.database, advice)
+        if is_usable and "extract" in done:
+            self._examine_counts(context)
         if is_usable and "map" in done:
             self._examine_models()
+
+    def _examine_counts(self, context: Context) -> None:
+        """Find images of which the database has more features than their file, as of another run.
+
+        Fewer are no fault: what is lacking is written by the next command.
+        """
+        counts = dict[str, int]()
+        with suppress(AffrectError):  # which has been found before
+            counts = context.features.num_keypoints()
+        with open_read_only(self.workspace.database) as connection:
+            tables = read_tables(connection)
+        others = list[str]()
+        for image_id, name in tables.names.items():
+            num_known, _ = tables.keypoints.get(image_id, (0, 0))
+            if num_known > counts.get(name, num_known):
+                others.append(name)
+        if others:
+            what = f"has fewer features than database.db of {such_as(sorted(others))}"
+            advice = "run the same 'extract' with --overwrite (run.log has the command)"
+            self.diagnosis.add("error", self.workspace.features, what, advice)
 
     def _require(self, path: Path) -> None:
         """Find a file that is missing."""

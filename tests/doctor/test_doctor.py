@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import tomli_w
+from damaged import execute
 from results import tree
 from small_scene import write_photographs
 from verified import CAMERAS
@@ -244,6 +245,16 @@ def test_array_of_an_absurd_size_is_damage_and_no_lack_of_memory(
     assert found.where == str(folders.out / store)
     assert f"damaged ({name[1:]} of shape {shape}" in found.what
     assert "'" in found.advice  # names a command that makes it again
+
+
+def test_features_of_another_run_are_found(folders: Folders) -> None:
+    double = "UPDATE keypoints SET rows = 2 * rows, data = data || data"
+    execute(folders.database, f"{double} WHERE image_id = 1")
+    found = [one for one in findings(folders.out) if "fewer features than" in one.what]
+    (finding,) = found
+    assert finding.where == str(folders.out / "features.h5")
+    assert finding.what == "has fewer features than database.db of a.png"
+    assert "extract" in finding.advice
 
 
 def test_stages_that_are_to_be_done_again_are_no_fault(folders: Folders) -> None:
