@@ -8,7 +8,7 @@ import dataclasses
 import json
 import shlex
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,10 +18,13 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, WARNED, check_database
 from colmap_affrect.colmap.database_copy import newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import has_model, model_folder, read_given_model
-from colmap_affrect.colmap.tables import NoDatabaseError
+from colmap_affrect.colmap.tables import (
+    NoDatabaseError,
+    open_read_only,
+    read_tables,
+)
 from colmap_affrect.errors import (
     AffrectError,
-    DatabaseError,
     Option,
     OptionError,
     WorkspaceError,
@@ -45,6 +48,7 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 MAX_ITEMS_SHOWN = 5  # display
 # Problems of databases that may be of use to COLMAP
 HARMLESS = WARNED | {"camera-panorama"}
+WRITABLE = "make it writable before running anything in it"
 SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
@@ -198,7 +202,7 @@ def examine_database(diagnosis: Diagnosis, path: Path, advice: str = "") -> bool
     except NoDatabaseError as error:
         _add_error(diagnosis, path, error, advice or "give a database")
         return False
-    except DatabaseError as error:
+    except AffrectError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
         _add_error(
             diagnosis, path, error, advice or with_flags(error.advice) or recover
@@ -249,9 +253,13 @@ def _examine_folder(diagnosis: Diagnosis, path: Path) -> None:
             stack.enter_context(workspace.locked())
         except (WorkspaceError, OptionError) as error:
             in_use = isinstance(error.__cause__, TimeoutError)
-            writable = "make it writable before running anything in it"
-            advice = "run doctor again when it is done" if in_use else writable
-            diagnosis.add("warning", path, _fault_of(error, path), advice)
+            advice = with_flags(error.advice)
+            severity: Severity = "warning"
+            if in_use:
+                advice = "run doctor again when it is done"
+            elif isinstance(error, OptionError):
+                severity = "error"  # no command works in it
+            diagnosis.add(severity, path, _fault_of(error, path), advice or WRITABLE)
             if in_use:
                 return
         _OutputFolder(diagnosis, workspace).examine()
@@ -310,8 +318,10 @@ class _OutputFolder:
             self._examine_stores(context)
         if "extract" in done:
             self._require(workspace.features)
+            if "match" in done:
+                self._require(workspace.matches)
             self._examine_pairs(context, are_listed="match" in done)
-        if done:
+        if not {"copy", "verify"}.isdisjoint(done):  # else the next stage makes it
             self._require(workspace.database)
         if not workspace.database.exists():
             return
@@ -319,8 +329,30 @@ class _OutputFolder:
         if done and not workspace.users_database:
             advice = f"remove it and {SAME_RUN}: it is made anew"
         is_usable = examine_database(self.diagnosis, workspace.database, advice)
+        if is_usable and "extract" in done:
+            self._examine_counts(context)
         if is_usable and "map" in done:
             self._examine_models()
+
+    def _examine_counts(self, context: Context) -> None:
+        """Find images of which the database has more features than their file, as of another run.
+
+        Fewer are no fault: what is lacking is written by the next command.
+        """
+        counts = dict[str, int]()
+        with suppress(AffrectError):  # which has been found before
+            counts = context.features.num_keypoints()
+        with open_read_only(self.workspace.database) as connection:
+            tables = read_tables(connection)
+        others = list[str]()
+        for image_id, name in tables.names.items():
+            num_known, _ = tables.keypoints.get(image_id, (0, 0))
+            if num_known > counts.get(name, num_known):
+                others.append(name)
+        if others:
+            what = f"has fewer features than database.db of {such_as(sorted(others))}"
+            advice = "run the same 'extract' with --overwrite (run.log has the command)"
+            self.diagnosis.add("error", self.workspace.features, what, advice)
 
     def _require(self, path: Path) -> None:
         """Find a file that is missing."""

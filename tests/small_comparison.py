@@ -18,6 +18,7 @@ from colmap_affrect.comparison.results import (
     SeedResult,
 )
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.image_failures import ImageFailure
 
 NAMES = (
     "<img src=x onerror=alert(1)>.png",
@@ -124,6 +125,9 @@ def _seed(
     )
 
 
+BROKEN = ImageFailure("damaged", values={"reason": "not a <readable> image"})
+
+
 def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodResult:
     return MethodResult(
         name,
@@ -131,7 +135,7 @@ def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodR
         seeds=tuple(seeds),
         wall_s={"extract": 12.25, "match": 1.5},
         peak_memory_bytes=123_400_000,
-        failures={"broken.png": "not a <readable> image"} if name == "sift" else {},
+        failed_images={"broken.png": BROKEN} if name == "sift" else {},
         options={"rectifier": {"name": "dense-shapes"}} if name == "default" else {},
         folder=f"methods/{name}",
         failed=failed,

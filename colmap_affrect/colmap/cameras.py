@@ -25,9 +25,8 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import Options
-from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 from colmap_affrect.project.tables import read_table
 
 Source = Literal["given", "exif", "exif-rescaled", "guess", "model"]
@@ -108,13 +107,13 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     with damage(path, how_to_make_again("verify", path.parent), WorkspaceError):
         if not path.exists():
             return {}
-        return _RECORDS.validate_json(read_regular(path))
+        return _RECORDS.validate_python(read_sealed(path))
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
     ordered = dict(sorted(records.items()))
-    replace_text(path, _RECORDS.dump_json(ordered, indent=1).decode())
+    write_sealed(path, _RECORDS.dump_json(ordered))
 
 
 @cache
@@ -175,6 +174,13 @@ class GivenCamera(Options):
     def said(self) -> Self:
         """The same of any image: equal where the same is said."""
         return self.changed(name="", camera="", where=Row("", ""))
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Focal length that its parameters say, the mean of two; it has some."""
+        like = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1)
+        like.params = list(self.params)
+        return float(like.mean_focal_length())
 
     @pydantic.model_validator(mode="after")
     def _says_all_once(self) -> Self:

@@ -5,13 +5,14 @@ So every record is followed to its end first. Models of ours have digests of fil
 """
 
 import json
+import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.regular_files import (
-    read_regular,
+    open_regular,
+    read_regular_text,
     require_regular,
     sha256_of_regular,
 )
@@ -32,23 +34,28 @@ Poses = dict[str, Pose]  # poses by image name
 MAX_SIDE_PX = 1 << 24
 # Coordinates beyond it are no positions: nothing can be computed with them; damage
 FAR = 1e12
+MAX_TEXT_BYTES = 1 << 14  # of the name of an image: no system has longer paths; format
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
 # File beside a model of ours, which has the digests of its files as ``model``
 SUMMARY = "summary.json"
 
 
 class _Reader:
-    """Follows the records of a file; EOFError where one goes beyond its end."""
+    """Follows the records of a file; EOFError where one goes beyond its end.
 
-    def __init__(self, data: bytes) -> None:
-        self.data = data
+    Memory has a small part of it, whatever the size of the file.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.size = file.seek(0, os.SEEK_END)
         self.position = 0
 
     def skip(self, num_bytes: int) -> int:
         """Go on, and return where that was."""
         start = self.position
         self.position += num_bytes
-        if self.position > len(self.data):
+        if self.position > self.size:
             raise EOFError
         return start
 
@@ -56,15 +63,17 @@ class _Reader:
         """Read values by their codes of :mod:`struct`."""
         layout = f"<{codes}"
         start = self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, start)
+        self.file.seek(start)
+        return struct.unpack(layout, self.file.read(struct.calcsize(layout)))
 
     def text(self) -> str:
         """Read a text that ends with a 0."""
-        end = self.data.find(b"\0", self.position)
-        if end < 0:
+        self.file.seek(self.position)
+        text, end, _ = self.file.read(MAX_TEXT_BYTES).partition(b"\0")
+        if not end:
             raise EOFError
-        start = self.skip(end + 1 - self.position)
-        return self.data[start:end].decode("utf-8")
+        self.skip(len(text) + 1)
+        return text.decode("utf-8")
 
 
 @cache
@@ -131,15 +140,16 @@ OLD_RECORDS = ("cameras.bin", "images.bin", "points3D.bin")
 def _read_records(path: Path) -> list[Any]:
     """Read all records of a file; StoreError unless they end where it ends."""
     with errors.damage(path, _mend(path.parent)):
-        reader = _Reader(read_regular(path))
         read_record = RECORDS[path.name]
-        try:
-            (num_records,) = reader.take("Q")
-            records = [read_record(reader) for _ in range(num_records)]
-        except EOFError:
-            raise ValueError("it ends within a record") from None
-        if reader.position < len(reader.data):
-            raise ValueError("something follows its last record")
+        with open_regular(path) as file:
+            reader = _Reader(file)
+            try:
+                (num_records,) = reader.take("Q")
+                records = [read_record(reader) for _ in range(num_records)]
+            except EOFError:
+                raise ValueError("it ends within a record") from None
+            if reader.position < reader.size:
+                raise ValueError("something follows its last record")
     return records
 
 
@@ -190,7 +200,7 @@ def _is_binary(folder: Path) -> bool:
 def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
-        known = json.loads(read_regular(folder / SUMMARY))["model"]
+        known = json.loads(read_regular_text(folder / SUMMARY))["model"]
     except errors.DAMAGE:
         return {}
     return known if isinstance(known, dict) else {}

@@ -12,8 +12,8 @@ from colmap_affrect.errors import DatabaseError, OptionError, with_arguments
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.regular_files import (
     NotAFileError,
+    first_bytes,
     open_regular,
-    read_regular,
     require_regular,
 )
 
@@ -54,7 +54,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
             _require_tables(connection, path)
             yield connection
     except DAMAGED as error:
-        if journal.exists() and read_regular(journal)[:8] == HOT_JOURNAL:
+        if journal.exists() and first_bytes(journal, 8) == HOT_JOURNAL:
             raise DatabaseError(
                 "a program that was writing to it was killed, or is still at work, and "
                 f"{journal.name} undoes the half of it",

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
@@ -48,8 +48,8 @@ from colmap_affrect.project.outputs import new_results, remove_own, temporary_fo
 from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.project.reasons import texts_of
 from colmap_affrect.project.record import first_difference
-from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import ModelSummary, largest_of
+from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import AnyMapper, Recipe
 from colmap_affrect.session.context import Context
@@ -222,10 +222,11 @@ class MethodRun:
     @property
     def result(self) -> MethodResult:
         """What is done of the method, as it is on disk."""
-        # A result of an older version is not valid: then features stay, and models are made again.
-        path = self.workspace.path / "result.json"
-        with suppress(FileNotFoundError, ValidationError):
-            return RESULT_JSON.validate_json(read_regular(path))
+        # One that an older version has written, or somebody has edited, is not valid: then
+        # features stay, and models are made again.
+        with suppress(FileNotFoundError, ValueError):
+            path = self.workspace.path / "result.json"
+            return RESULT_JSON.validate_python(read_sealed(path))
         return MethodResult(
             self.method.label,
             summary=self.method.summary,
@@ -252,7 +253,7 @@ class MethodRun:
         asked = json.loads(json.dumps(asked))  # as it is read: tuples are lists
         mend = ("use ", Option("overwrite"), " to redo the methods that are named")
         with damage(record, mend):
-            known = json.loads(read_regular(record)) if record.exists() else {}
+            known = read_sealed(record) if record.exists() else {}
             difference = first_difference(known, asked)
         if folder.exists() and difference:
             raise ConflictError(
@@ -267,7 +268,7 @@ class MethodRun:
                 ),
             )
         self.workspace.begin()
-        replace_text(record, json.dumps(asked, indent=1))
+        write_sealed(record, json.dumps(asked))
 
     def run(self) -> None:
         """Extract, match, verify and map; what is there is kept."""
@@ -278,8 +279,7 @@ class MethodRun:
                 failures = self._match_recipe(watch)
             else:
                 failures = self._match_sift(watch)
-            texts = {name: why.text() for name, why in failures.items()}
-            self.keep(failures=texts, wall_s=watch.seconds)
+            self.keep(failed_images=failures, wall_s=watch.seconds)
         done = {result.seed: result for result in self.result.seeds}
         for seed in self.options.seeds:
             if seed not in done:
@@ -291,9 +291,8 @@ class MethodRun:
         """Change fields of the result on disk."""
         peak = max(self.result.peak_memory_bytes, peak_memory_bytes())
         result = replace(self.result, peak_memory_bytes=peak, **values)
-        replace_bytes(
-            self.workspace.path / "result.json", RESULT_JSON.dump_json(result, indent=1)
-        )
+        path = self.workspace.path / "result.json"
+        write_sealed(path, RESULT_JSON.dump_json(result))
 
     def _match_sift(self, watch: Stopwatch) -> dict[str, ImageFailure]:
         """Extract and match as COLMAP does; return why images cannot be used."""

@@ -14,6 +14,7 @@ from typing import Any, Self
 from colmap_affrect.colmap.model_files import Poses, pose_errors, relative_pose
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.image_failures import ImageFailure, texts_of_failures
 
 PairErrors = Mapping[Pair, tuple[float, float]]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
@@ -205,13 +206,18 @@ class MethodResult:
     options: Mapping[str, Any] = field(default_factory=dict)
     failed: str = ""  # why it failed as a whole; empty if it did not
     # Images that cannot be used: why
-    failures: Mapping[str, str] = field(default_factory=dict)
+    failed_images: Mapping[str, ImageFailure] = field(default_factory=dict)
     lacks: str = ""  # how to get the weights that it ran without
     # Seconds of stages before all seeds
     wall_s: Mapping[str, float] = field(default_factory=dict)
     peak_memory_bytes: int = 0
     # In the order asked for; empty if the method failed
     seeds: tuple[SeedResult, ...] = ()
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why images cannot be used, in words, by their names."""
+        return texts_of_failures(self.failed_images)
 
     def span(self, measure: str) -> Span | None:
         """Return one of ``MEASURES`` over the seeds that have it; None without any."""

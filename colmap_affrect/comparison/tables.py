@@ -14,7 +14,8 @@ from colmap_affrect.comparison.results import (
     Span,
     measured,
 )
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import such_as, with_flags
+from colmap_affrect.project.image_failures import failures_to_mapping, texts_of_failures
 from colmap_affrect.project.report import by_story
 
 BYTES_PER_MB = 1_000_000  # theory
@@ -246,6 +247,8 @@ def to_json(comparison: Comparison) -> str:
         values["registered_names"] = {
             str(s.seed): s.registered_names for s in method.seeds
         }
+        values["failures"] = texts_of_failures(method.failed_images, with_flags)
+        values["failed_images"] = failures_to_mapping(method.failed_images)
         values["total_s"] = method.total_s
         values["wall_s"] = method.stage_seconds
         for seed, numbers in zip(method.seeds, values["seeds"], strict=True):

@@ -27,12 +27,12 @@ from colmap_affrect.mappers.mapping import (
 )
 from colmap_affrect.mappers.wrong_models import copy_thrown_away
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.atomic_files import cannot_write, replace_text
+from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.match_state import LearnedModels, Worth
 from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
-from colmap_affrect.project.regular_files import read_regular_text
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.map import map_images
@@ -248,7 +248,8 @@ def keep_best(context: Context) -> None:
             shutil.copytree(folder, new / folder.name)
         copy_thrown_away(workspace.sparse, new)
         shutil.copy(workspace.matches, new / workspace.matches.name)
-        replace_text(new / SCORE, json.dumps([_set_of(context), present]))
+        kept = {"of_set": _set_of(context), "num_right_poses": present}
+        write_sealed(new / SCORE, json.dumps(kept))
 
 
 def num_right_poses_of_best(context: Context) -> float:
@@ -257,8 +258,9 @@ def num_right_poses_of_best(context: Context) -> float:
     if not path.exists():
         return 0.0
     try:
-        of_set, found = json.loads(read_regular_text(path))
-        return float(found) if of_set == _set_of(context) else 0.0
+        kept = read_sealed(path)
+        is_same = kept["of_set"] == _set_of(context)
+        return float(kept["num_right_poses"]) if is_same else 0.0
     except DAMAGE:
         return 0.0
 

@@ -25,7 +25,7 @@ from colmap_affrect.colmap.verification import (
     estimate_geometry,
 )
 from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
-from colmap_affrect.errors import AffrectError, Option, OptionError, with_flags
+from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
 from colmap_affrect.evaluation.results import (
@@ -44,6 +44,7 @@ from colmap_affrect.progress import GivenProgress, Progress, Stopwatch
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.image_failures import ImageFailure, failure_of
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.paths import PathLike, as_path, resolved
 from colmap_affrect.project.report import installed_versions
@@ -137,7 +138,7 @@ class RecipeRun:
         features = output_path / "features" / name
         features.parent.mkdir(parents=True, exist_ok=True)
         self._store = FeatureStore(features)
-        self.failures: dict[str, str] = {}  # images that cannot be used: why
+        self.failed: dict[str, ImageFailure] = {}  # images that cannot be used: why
         self._lock = Lock()  # of extraction and of the store
 
     def results(self, progress: Progress) -> list[PairResult]:
@@ -210,7 +211,7 @@ class RecipeRun:
                 break
         if best is not None:
             return best
-        failures = [self.failures[n] for n in pair.images if n in self.failures]
+        failures = [self.failed[n].text() for n in pair.images if n in self.failed]
         return _Matched(failure="; ".join(failures))
 
     def _matched_at(
@@ -262,13 +263,13 @@ class RecipeRun:
         base = self.recipe.extraction.levels[level].base
         there = store.level_ranges(name) if name in store.names() else {}
         for missing in sorted({0, base, level} - there.keys()):
-            if name in self.failures:
+            if name in self.failed:
                 return False
             try:
                 found = self._extractor.extract_file(path, name, intrinsics, missing)
             except AffrectError as error:
-                self.failures[name] = with_flags(error.words)
-                logger.warning("%s", self.failures[name])
+                self.failed[name] = failure_of(error)
+                logger.warning("%s", self.failed[name].text())
                 return False
             if found.not_rectified:
                 logger.warning("%s: not rectified: %s", name, found.not_rectified)
@@ -414,6 +415,6 @@ def _recipe_result(run: RecipeRun, results: Sequence[PairResult]) -> RecipeResul
             "inliers": fmean(result.num_inliers for result in results),
             SECONDS: sum(result.seconds for result in results),
         },
-        failures=run.failures,
+        failed=run.failed,
         pairs=tuple(results),
     )

@@ -10,8 +10,14 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
+from colmap_affrect.errors import with_flags
 from colmap_affrect.evaluation.truths import PairResult
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.image_failures import (
+    ImageFailure,
+    failures_to_mapping,
+    texts_of_failures,
+)
 
 DATA = Path(__file__).with_name("published.toml")
 SECONDS = "seconds"  # the column of all time that a recipe took
@@ -38,8 +44,13 @@ class RecipeResult:
     # number of failed pairs, seconds in all, and means over the pairs: ``solved`` from 0 to 1,
     # ``keypoints`` of an image, ``matches``, ``inliers``
     costs: Mapping[str, float]
-    failures: Mapping[str, str]  # images that cannot be used, with the reason
+    failed: Mapping[str, ImageFailure]  # images that cannot be used, with the reason
     pairs: tuple[PairResult, ...]  # in the order of the dataset; failed ones among them
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why images cannot be used, in words, by their names."""
+        return texts_of_failures(self.failed)
 
 
 @documented
@@ -63,7 +74,12 @@ class Evaluation(Summarized):
     def to_json(self) -> str:
         """Return everything as JSON, recipes by name; infinite errors are null."""
         values = json.loads(TypeAdapter(Evaluation).dump_json(self))
-        values["recipes"] = {recipe.pop("name"): recipe for recipe in values["recipes"]}
+        recipes = {}
+        for recipe, written in zip(self.recipes, values["recipes"], strict=True):
+            written["failures"] = texts_of_failures(recipe.failed, with_flags)
+            written["failed"] = failures_to_mapping(recipe.failed)
+            recipes[written.pop("name")] = written
+        values["recipes"] = recipes
         return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
 
     def summary(self) -> str:

@@ -27,7 +27,12 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.image_failures import UnusableImageError, unusable
+from colmap_affrect.project.image_failures import (
+    ImageFailure,
+    UnusableImageError,
+    texts_of_failures,
+    unusable,
+)
 from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_results
 from colmap_affrect.project.paths import PathLike, as_path
 
@@ -46,10 +51,15 @@ class ConversionReport(Summarized):
     """Files that COLMAP can read as they are."""
     renamed: dict[str, str] = field(default_factory=dict)
     """New names, by those that were taken already."""
-    failures: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, ImageFailure] = field(default_factory=dict)
     """Why files cannot be read."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Why folders were passed over."""
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why files cannot be read, in words."""
+        return texts_of_failures(self.failed)
 
     def summary(self) -> str:
         """Return one line, and one for each file that failed or has another name than usual."""
@@ -59,7 +69,7 @@ class ConversionReport(Summarized):
             f"{len(self.copied)} copied",
             *[f"{new}: instead of {old}" for old, new in self.renamed.items()],
             *[f"{name}: {why}" for name, why in self.left_out.items()],
-            *[f"not {name}: {why}" for name, why in self.failures.items()],
+            *[f"not {name}: {why.text()}" for name, why in self.failed.items()],
         ]
         return "\n".join(lines)
 
@@ -114,7 +124,7 @@ def convert_images(
         if not (report.written or report.copied):
             raise ImageError(
                 f"none of {len(names)} files can be converted; the first: "
-                f"{report.failures[names[0]]}",
+                f"{report.failed[names[0]].text()}",
                 where=image_path,
             )
     return report
@@ -157,7 +167,7 @@ class _Conversion:
         except UnusableImageError as error:
             for made in written:
                 (self.folder / made).unlink()
-            self.report.failures[name] = error.failure.text()
+            self.report.failed[name] = error.failure
 
     def _copy(self, name: str, data: Bytes) -> None:
         """Copy a photograph with its times; ImageError if it cannot be decoded."""

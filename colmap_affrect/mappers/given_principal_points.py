@@ -4,16 +4,20 @@ A wrong one, as of a calibration of other photographs or of the whole of a crop,
 wrong rotations, and nothing else shows it: it stays as the user says, so that no search finds a
 better one. So models are adjusted once more, with it and without: at first as if all photographs
 of which the user says the same had one camera, which tells most of it, then with their own.
+
+Of a large set, photographs that see much of one another stand for all of which the user says the
+same: what is wrong with that is wrong with each of them.
 """
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.geometry.lines import MIDDLE_SIGMA, SHIFTED_SIGMA
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappingTask
@@ -38,6 +42,13 @@ ones are usual of whole photographs, for which many users give the middle."""
 NUM_COORDINATES = 2  # of a principal point, each a free parameter; theory
 
 
+MAX_NUM_SAMPLES = 3
+"""Of a large set, each of which is judged as a set by itself; resource."""
+MAX_POINTS_OF_IMAGE = 300
+"""That are looked at, to find images that see the same; resource."""
+
+Said = tuple[float, ...]
+"""A principal point that the user gives, and the size of the images, px."""
 Given = Mapping[int, pycolmap.Camera]
 """Cameras whose principal points the user has given, by id."""
 
@@ -61,8 +72,126 @@ def contradicted_principal_points(
         One contradiction for all images of the same given values.
     """
     given = _given_cameras(used_cameras(model), task)
-    is_tried = model.num_reg_images() <= MAX_TRIAL_IMAGES and model.num_points3D() > 0
-    if not given or not is_tried:
+    if not given or not model.num_points3D():
+        return []
+    if model.num_reg_images() <= MAX_TRIAL_IMAGES:
+        return _judged(model, task)
+    found = list[PrincipalPointContradiction]()
+    names_of = _names_of_same(model, given)
+    largest = sorted(names_of, key=lambda said: (-len(names_of[said]), said))
+    judged = set[Said]()
+    for _ in range(MAX_NUM_SAMPLES):
+        left = [said for said in largest if said not in judged]
+        if not left:
+            break
+        sample = _sample(model, names_of[left[0]])
+        said_of_sample = set(_names_of_same(sample, given))
+        for one in _judged(sample, task):
+            whole = _of_all_of_same(one, names_of)
+            if whole and whole.turns_deg.keys().isdisjoint(_names(found)):
+                found.append(whole)
+        judged |= {left[0], *said_of_sample}
+    return found
+
+
+def _names_of_same(
+    model: pycolmap.Reconstruction, given: Given
+) -> dict[Said, list[str]]:
+    """Return the names of the registered images for which the user says the same."""
+    found = defaultdict[Said, list[str]](list)
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        if image.camera_id in given:
+            found[_said(given[image.camera_id])].append(image.name)
+    return dict(found)
+
+
+def _names(found: Sequence[PrincipalPointContradiction]) -> set[str]:
+    """Return the names of all images of some contradictions."""
+    return {name for one in found for name in one.turns_deg}
+
+
+def _sample(
+    model: pycolmap.Reconstruction, names: Collection[str]
+) -> pycolmap.Reconstruction:
+    """Return a copy with a part of the images, ``MAX_TRIAL_IMAGES`` about.
+
+    It begins with the image of some names that sees most, and goes on with those that see most of
+    what is seen already. What a rig takes at once is taken together.
+
+    Args:
+        model: It stays as it is.
+        names: Of images, one of which is the first.
+    """
+    images = [model.find_image_with_name(name) for name in names]
+    first = max(images, key=lambda image: (image.num_points3D, -image.image_id))
+    chosen = {first.frame_id}
+    num_images = 0
+    shared = Counter[int]()  # points that images share with the chosen ones, by frame
+    newest = first.frame_id
+    while True:
+        of_frame = _images_of_frame(model, newest)
+        num_images += len(of_frame)
+        for image in of_frame:
+            shared.update(_frames_that_see_the_same(model, image))
+        others = [(num, -key) for key, num in shared.items() if key not in chosen]
+        if not others or num_images >= MAX_TRIAL_IMAGES:
+            break
+        newest = -max(others)[1]
+        chosen.add(newest)
+    copy = pycolmap.Reconstruction(model)
+    for frame_id in list(copy.reg_frame_ids()):
+        if frame_id not in chosen:
+            copy.deregister_frame(frame_id)
+    return copy
+
+
+def _images_of_frame(
+    model: pycolmap.Reconstruction, frame_id: int
+) -> list[pycolmap.Image]:
+    """Return the images that were taken at once."""
+    found = []
+    for data_id in model.frames[frame_id].image_ids:
+        if data_id.id in model.images:
+            found.append(model.images[data_id.id])
+    return found
+
+
+def _frames_that_see_the_same(
+    model: pycolmap.Reconstruction, image: pycolmap.Image
+) -> Counter[int]:
+    """Count which frames see points of an image, a sample of them."""
+    found = Counter[int]()
+    points = image.get_observation_points2D()
+    step = sampling_step(len(points), MAX_POINTS_OF_IMAGE)
+    for point2d in points[::step]:
+        track = model.points3D[point2d.point3D_id].track
+        found.update({model.images[e.image_id].frame_id for e in track.elements})
+    return found
+
+
+def _of_all_of_same(
+    one: PrincipalPointContradiction, names_of: Mapping[Said, Collection[str]]
+) -> PrincipalPointContradiction | None:
+    """Return a contradiction of a sample for all images of which the user says the same.
+
+    Rotations of those that are not in the sample change by as much as usual there. None where no
+    image of the sample is among them.
+    """
+    for names in names_of.values():
+        if not one.turns_deg.keys().isdisjoint(names):
+            usual_deg = float(np.median(list(one.turns_deg.values())))
+            turns_deg = {name: one.turns_deg.get(name, usual_deg) for name in names}
+            return replace(one, turns_deg=turns_deg)
+    return None
+
+
+def _judged(
+    model: pycolmap.Reconstruction, task: MappingTask
+) -> list[PrincipalPointContradiction]:
+    """Return what the points of a model of few images contradict."""
+    given = _given_cameras(used_cameras(model), task)
+    if not given:
         return []
     fewer = with_fewer_points(model)
     shared_ids = {} if has_rigs(model) else _ids_of_same(given)
@@ -87,7 +216,7 @@ def _given_cameras(
     return found
 
 
-def _said(camera: pycolmap.Camera) -> tuple[float, ...]:
+def _said(camera: pycolmap.Camera) -> Said:
     """Return a given principal point and the size of the images, px."""
     center = (float(camera.principal_point_x), float(camera.principal_point_y))
     return (*center, float(camera.width), float(camera.height))
@@ -182,7 +311,7 @@ def _far_ones(
         model: The model with these.
         free: The same with free ones.
     """
-    groups = defaultdict[tuple[float, ...], list[int]](list)
+    groups = defaultdict[Said, list[int]](list)
     for key, camera in sorted(given.items()):
         groups[_said(camera)].append(key)
     turns_deg = median_turns_deg(model, free)

@@ -43,16 +43,15 @@ from colmap_affrect.mappers.wrong_models import (
     thrown_away_of,
     write_thrown_away,
 )
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.reasons import Doubt
-from colmap_affrect.project.regular_files import read_regular
 from colmap_affrect.project.report import (
     DOUBTFUL,
     SURE,
     ModelSummary,
     kept_probability,
 )
+from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 
 ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
 # What was begun is removed while a call of COLMAP may still write there.
@@ -72,7 +71,7 @@ _SUMMARY_FILE = TypeAdapter(_SummaryFile)
 def write_summary(summary: ModelSummary, folder: Path) -> None:
     """Keep the summary of the model in a folder."""
     content = _SummaryFile(file_digests(folder), summary)
-    replace_text(folder / SUMMARY, _SUMMARY_FILE.dump_json(content, indent=2).decode())
+    write_sealed(folder / SUMMARY, _SUMMARY_FILE.dump_json(content))
 
 
 def copy_with_keypoints(folder: Path, target: Path, database_path: Path) -> None:
@@ -104,7 +103,7 @@ def read_summary(folder: Path) -> ModelSummary:
     again = how_to_make_again("map", folder.parent.parent)
     mend = f"if you have edited the model, copy it to a folder of its own; then {again}"
     with damage(folder / SUMMARY, mend):
-        return _SUMMARY_FILE.validate_json(read_regular(folder / SUMMARY)).summary
+        return _SUMMARY_FILE.validate_python(read_sealed(folder / SUMMARY)).summary
 
 
 def read_summaries(sparse_path: Path) -> list[ModelSummary]:

@@ -22,9 +22,8 @@ from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     PoseById,
 )
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.reasons import Doubt
-from colmap_affrect.project.regular_files import read_regular
+from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 
 THROWN_AWAY = "thrown_away.json"  # beside the models that are kept
 WITHOUT_FALSE_PAIRS = (
@@ -67,8 +66,7 @@ _FILE = TypeAdapter(ThrownAway)
 def write_thrown_away(thrown_away: ThrownAway, sparse_path: Path) -> None:
     """Keep what is known of models that were thrown away beside those that are kept."""
     if thrown_away.doubts:
-        content = _FILE.dump_json(thrown_away, indent=2).decode()
-        replace_text(sparse_path / THROWN_AWAY, content)
+        write_sealed(sparse_path / THROWN_AWAY, _FILE.dump_json(thrown_away))
 
 
 def read_thrown_away(sparse_path: Path) -> ThrownAway:
@@ -77,7 +75,7 @@ def read_thrown_away(sparse_path: Path) -> ThrownAway:
     if not path.exists():
         return ThrownAway()
     try:
-        return _FILE.validate_json(read_regular(path))
+        return _FILE.validate_python(read_sealed(path))
     except DAMAGE:  # it only says more; mapping again makes it again
         return ThrownAway()
 

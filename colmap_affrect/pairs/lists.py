@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, overload
+from typing import Annotated, Any, Literal, TextIO, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +247,8 @@ def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Ind
     problems: list[tuple[int, str]] = []
     try:
         with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
-            found = np.fromiter(_codes(file, names, folders, problems), np.int64)
+            lines = _lines(file)
+            found = np.fromiter(_codes(lines, names, folders, problems), np.int64)
     except OSError as error:
         raise OptionError(f"cannot be read ({error.strerror})", where=path) from error
     except UnicodeDecodeError as error:
@@ -262,6 +263,26 @@ def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Ind
             where=path,
         )
     return found
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """Yield the lines of a list, of one that is too long for two names its beginning, and no more.
+
+    A file without line ends may have any size. Long comments are gone over.
+    """
+    is_rest = False  # of a long comment
+    line = file.readline(LONGEST_LINE + 1)
+    while line:
+        is_long = len(line) > LONGEST_LINE and not line.endswith("\n")
+        says_nothing = not line.strip() or line.lstrip().startswith("#")
+        if not is_rest and (not is_long or not says_nothing):
+            yield line
+            if is_long:
+                return
+        elif not is_long:
+            yield "\n"
+        is_rest = is_long
+        line = file.readline(LONGEST_LINE + 1)
 
 
 def _codes(

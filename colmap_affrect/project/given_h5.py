@@ -3,6 +3,7 @@
 Links and data in other files are not followed, and the shape and kind of arrays is checked.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -69,21 +70,33 @@ class GivenFile:
             raise StoreError(
                 f"{key} has shape {stored}, expected {wanted}", where=self.path
             )
-        if np.prod([float(size) for size in stored]) > MAX_VALUES:
-            raise StoreError(
-                f"{key} of shape {stored} is too large to be true", where=self.path
-            )
         with damage(self.path, MEND):
-            num_bytes = self.file[key].nbytes
-            stored_bytes = self.file[key].id.get_storage_size()
-            if num_bytes > max(LARGE_BYTES, MOST_COMPRESSED * stored_bytes):
-                raise ValueError(
-                    f"{key} of shape {stored} was never written, but for a small part"
-                )
+            require_plausible(self.file[key].id, key)
             if self.file[key].dtype.kind not in kinds:
                 raise ValueError(f"{key} does not hold numbers, or no whole ones")
             _require_filters(self.path, self.file[key])
             return np.asarray(self.file[key][()])
+
+
+def require_plausible(dataset: h5py.h5d.DatasetID, key: str) -> None:
+    """Refuse an array that would take memory for values which nobody can have written.
+
+    Args:
+        dataset: the array.
+        key: what it is called.
+
+    Raises:
+        ValueError: it says that it is larger than that.
+    """
+    shape = dataset.shape or ()
+    num_values = math.prod(shape)
+    if num_values > MAX_VALUES:
+        raise ValueError(f"{key} of shape {shape} is too large to be true")
+    num_bytes = num_values * dataset.dtype.itemsize
+    if num_bytes > max(LARGE_BYTES, MOST_COMPRESSED * dataset.get_storage_size()):
+        raise ValueError(
+            f"{key} of shape {shape} was never written, but for a small part"
+        )
 
 
 def _require_filters(path: Path, dataset: h5py.Dataset) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.errors import Option, StoreError, damage, how_to_make_again
 from colmap_affrect.project import atomic_files
+from colmap_affrect.project.given_h5 import require_plausible
 from colmap_affrect.project.regular_files import require_regular
 
 CHECKSUM = "crc32"  # of the values of a dataset, its attribute
@@ -98,6 +99,7 @@ def read_checked(group: h5py.Group, name: str) -> NDArray[Any]:
     """Read a dataset; ValueError if it does not hold what was written."""
     # This takes a third of the time of group[name]
     dataset = h5py.h5d.open(group.id, name.encode())
+    require_plausible(dataset, name)
     values = np.zeros(dataset.shape, dataset.dtype)
     if values.size:
         dataset.read(h5py.h5s.ALL, h5py.h5s.ALL, values)

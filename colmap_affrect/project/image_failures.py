@@ -1,10 +1,18 @@
 """Why a photograph cannot be used: codes with values, and the one place that says them."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from colmap_affrect.errors import MEMORY_ADVICE, ImageError, Words, with_flags
+from colmap_affrect.errors import (
+    MEMORY_ADVICE,
+    AffrectError,
+    ImageError,
+    Words,
+    with_arguments,
+    with_flags,
+)
 from colmap_affrect.options import documented
 
 FailureCode = Literal[
@@ -102,9 +110,14 @@ class ImageFailure:
             return HEIC_ADVICE
         return ADVICE.get(self.code, "")
 
+    @property
+    def words(self) -> Words:
+        """All that is said of it."""
+        return UnusableImageError(self).words
+
     def text(self) -> str:
-        """Return all of it in words, in one line."""
-        return with_flags(UnusableImageError(self).words)
+        """Return all of it in one line, to who gives commands."""
+        return with_flags(self.words)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
@@ -121,6 +134,33 @@ class UnusableImageError(ImageError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.failure,)
+
+
+def failure_of(error: AffrectError) -> ImageFailure:
+    """Return why a photograph cannot be used, by the error that came of it."""
+    if isinstance(error, UnusableImageError):
+        return error.failure
+    where = error.where if isinstance(error.where, str | Path) else ""
+    return ImageFailure(
+        "unreadable", str(where), values={"reason": with_flags(error.what)}
+    )
+
+
+def texts_of_failures(
+    failed: Mapping[str, ImageFailure], said: Callable[[Words], str] = with_arguments
+) -> dict[str, str]:
+    """Return why photographs cannot be used, in words, by their names.
+
+    Args:
+        failed: why, by name.
+        said: what options are called: :func:`with_arguments`, or :func:`with_flags`.
+    """
+    return {name: said(why.words) for name, why in failed.items()}
+
+
+def failures_to_mapping(failed: Mapping[str, ImageFailure]) -> dict[str, Any]:
+    """Return what files for programs have of photographs that cannot be used."""
+    return {name: why.to_mapping() for name, why in failed.items()}
 
 
 def unusable(

@@ -103,6 +103,30 @@ def refuse_what_waits(path: Path) -> None:
         ) from error
 
 
+def refuse_other_kind(
+    path: Path, files: Collection[str], folders: Collection[str]
+) -> None:
+    """Refuse a folder in the place of a file of ours, and the other way round.
+
+    Args:
+        path: what is there.
+        files: names that only files have.
+        folders: names that only folders have.
+
+    Raises:
+        OptionError: it is of the other kind.
+    """
+    advice = "move it elsewhere, and run the same command again"
+    if path.name in files and path.is_dir():
+        raise OptionError(
+            "is a folder, in the place of a file", where=path, advice=advice
+        )
+    if path.name in folders and path.is_file():
+        raise OptionError(
+            "is a file, in the place of a folder", where=path, advice=advice
+        )
+
+
 @contextmanager
 def new_results(
     *targets: Path, names: Collection[str] = (), replaces: bool = False

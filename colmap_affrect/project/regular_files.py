@@ -62,6 +62,12 @@ def open_regular(path: Path) -> io.BufferedReader:
     return file
 
 
+def first_bytes(path: Path, most: int) -> bytes:
+    """Return the beginning of a regular file; OSError, which may be NotAFileError."""
+    with open_regular(path) as file:
+        return file.read(most)
+
+
 def read_regular(path: Path) -> bytes:
     """Return what a regular file holds; OSError, which may be NotAFileError.
 

@@ -1,5 +1,6 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
+import itertools
 import json
 import math
 import platform
@@ -9,10 +10,14 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import such_as, with_arguments, with_flags
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
-from colmap_affrect.project.image_failures import ImageFailure
+from colmap_affrect.project.image_failures import (
+    ImageFailure,
+    failures_to_mapping,
+    texts_of_failures,
+)
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import (
     Doubt,
@@ -153,18 +158,21 @@ class StageReport(Summarized):
     @property
     def failures(self) -> dict[str, str]:
         """Why images cannot be used, in words, by their names."""
-        return {name: why.text() for name, why in self.failed.items()}
+        return texts_of_failures(self.failed)
 
     @property
     def warnings(self) -> dict[str, str]:
         """What went less well than asked for, in words, by what it is about."""
-        return texts_by_subject(self.warned)
+        return texts_by_subject(self.warned, with_arguments)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""
-        failed = {name: why.to_mapping() for name, why in self.failed.items()}
+        failed = failures_to_mapping(self.failed)
         warned = [warning.to_mapping() for warning in self.warned]
-        in_words = {"failures": self.failures, "warnings": self.warnings}
+        in_words = {
+            "failures": texts_of_failures(self.failed, with_flags),
+            "warnings": texts_by_subject(self.warned),
+        }
         return {**asdict(self), **in_words, "failed": failed, "warned": warned}
 
     def summary(self) -> str:
@@ -485,7 +493,7 @@ class ReconstructionReport(Summarized):
             *self._preset_lines(),
         ]
         if with_warnings:
-            warnings = self.warnings.items()
+            warnings = self.warnings_with_flags().items()
             lines += _some(f"warning     {name}: {why}" for name, why in warnings)
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines.append(f"seconds     {seconds}")
@@ -493,6 +501,11 @@ class ReconstructionReport(Summarized):
             texts = filter(None, (advice.why, advice.command))
             lines.append("try         " + "\n            ".join(texts))
         return "\n".join(lines)
+
+    def warnings_with_flags(self) -> dict[str, str]:
+        """Return the warnings as pages and the terminal show them."""
+        of_stages = (stage.warned for stage in self.stages)
+        return texts_by_subject(itertools.chain.from_iterable(of_stages))
 
     def _extension_lines(self) -> list[str]:
         if not self.extended:

@@ -1,9 +1,10 @@
 """What went less well than asked for: codes with values, and the one place that says them."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from colmap_affrect.errors import Option, Words, with_flags
 from colmap_affrect.options import documented
 
 WarningCode = Literal[
@@ -43,11 +44,13 @@ ODD_NAMES: dict[OddName, str] = {
 }
 """Why lists of images, one a line, cannot hold a name, and what to do."""
 
-SENTENCES: dict[WarningCode, str] = {
+SENTENCES: dict[WarningCode, Words] = {
     "camera_stands_still": (
         "nothing moves between most photographs, so that matches tell nothing of depth: the "
         "camera stands still; take photographs from several places, or give masks of what stands "
-        "still (--mask-path) where something turns before it"
+        "still (",
+        Option("mask-path"),
+        ") where something turns before it",
     ),
     "control_character": (
         f"{{num}} left out, such as {{example}}: {ODD_NAMES['control_character']}"
@@ -65,8 +68,9 @@ SENTENCES: dict[WarningCode, str] = {
     ),
     "inputs_changed": "{what}; all that hangs on them is made again",
     "low_contrast": (
-        "is low in {num} of {num_images} photographs, such as {example}; it was stretched "
-        "(--set stretch_contrast=false leaves it as it is)"
+        "is low in {num} of {num_images} photographs, such as {example}; it was stretched (",
+        Option("set", "stretch_contrast=false"),
+        " leaves it as it is)",
     ),
     "name_not_utf_8": (
         f"{{num}} left out, such as {{example}}: {ODD_NAMES['name_not_utf_8']}"
@@ -93,13 +97,18 @@ SENTENCES: dict[WarningCode, str] = {
     ),
     "stationary_matches": (
         "{num_matches} matches of {num_pairs} pairs never move (a caption, a frame, a watermark, "
-        "or the background of something that turns?) and were left out "
-        "(--set matching.filter_stationary_matches=false keeps them)"
+        "or the background of something that turns?) and were left out (",
+        Option("set", "matching.filter_stationary_matches=false"),
+        " keeps them)",
     ),
     "thumbnails": (
         "left out: thumbnails that a NAS or another system keeps, not photographs"
     ),
-    "time_over": "it is over; the same command without --max-time tries more",
+    "time_over": (
+        "it is over; the same again without ",
+        Option("max-time"),
+        " tries more",
+    ),
     "video": (
         "{num} left out, such as {example}: it is a video; take photographs out of it, as: "
         "ffmpeg -i it -vf fps=2 %04d.jpg"
@@ -124,9 +133,14 @@ class StageWarning:
     values: dict[str, int | str] = field(default_factory=dict)
     """Numbers and names that belong to it."""
 
+    @property
+    def words(self) -> Words:
+        """What is said of it, without what it is about."""
+        return filled(SENTENCES[self.code], self.values)
+
     def text(self) -> str:
-        """Return it in words, without what it is about."""
-        return SENTENCES[self.code].format(**self.values)
+        """Return it in words, without what it is about, to who gives commands."""
+        return with_flags(self.words)
 
     def line(self) -> str:
         """Return it in words, in one line."""
@@ -138,11 +152,28 @@ class StageWarning:
         return {**found, **self.values}
 
 
-def texts_by_subject(warnings: Iterable[StageWarning]) -> dict[str, str]:
-    """Return warnings in words, by what they are about."""
+def filled(words: Words, values: Mapping[str, object]) -> Words:
+    """Return words with values in the place of their names in braces."""
+    if isinstance(words, tuple):
+        return tuple(filled(part, values) for part in words)
+    return words.format(**values) if isinstance(words, str) else words
+
+
+def texts_by_subject(
+    warnings: Iterable[StageWarning], said: Callable[[Words], str] = with_flags
+) -> dict[str, str]:
+    """Return warnings in words, by what they are about.
+
+    Args:
+        warnings: of one stage, or of several.
+        said: what options are called: :func:`with_flags`, or :func:`with_arguments`.
+
+    Returns:
+        Texts by image, file, folder, or what else they are about.
+    """
     found = dict[str, str]()
     for warning in warnings:
         before = found.get(warning.about)
-        text = warning.text()
+        text = said(warning.words)
         found[warning.about] = f"{before}; {text}" if before else text
     return found

@@ -44,9 +44,15 @@ FILES_OF_MODEL = {
 FILES_BESIDE_MODELS = {"thrown_away.json"}
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends; resource
 OWN_STEMS = {  # how names of files and folders begin that are written here
-    "cameras", "config", "database", "features", "guided", "matches", "methods", "pairs",
-    "report", "run", "shared", "sparse",
+    "cameras", "config", "database", "features", "guided", "mapped", "matches", "methods",
+    "pairs", "report", "run", "shared", "sparse",
 }  # fmt: skip
+OWN_FILES = {  # which are never folders
+    outputs.LOCK, "cameras.json", "config.toml", "database.db", "database.db.seal",
+    "features.h5", "guided.h5", "mapped.db", "matches.h5", "pairs.txt", "report.html",
+    "report.json", "run.log",
+}  # fmt: skip
+OWN_FOLDERS = {"sparse", "sparse.best", "sparse.learned", "sparse.snapshots"}
 
 
 class Workspace:
@@ -150,12 +156,16 @@ class Workspace:
                 )
 
     def _refuse_links_and_pipes(self) -> None:
-        """Refuse what has the name of a file of ours, and leads elsewhere or cannot be read."""
+        """Refuse what has the name of a file of ours, and leads elsewhere or cannot be read.
+
+        A folder in the place of a file would be removed with all that is in it.
+        """
         for path in self.path.iterdir():
             stem = path.name.partition(".")[0]
             if stem in OWN_STEMS or path.name == outputs.LOCK:
                 outputs.refuse_link(path)
                 outputs.refuse_what_waits(path)
+            outputs.refuse_other_kind(path, OWN_FILES, OWN_FOLDERS)
 
     def begin(self) -> None:
         """Make the folder, unless it is there, and say in its log whose it is."""

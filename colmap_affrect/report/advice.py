@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.errors import such_as
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.images.photographs import MaskOptions
@@ -64,6 +65,11 @@ class _Case:
         doubts = itertools.chain.from_iterable(of_images)
         return any(doubt.code == "something_moves" for doubt in doubts)
 
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the points of the model contradict a given principal point."""
+        return bool(self.model.principal_point_contradictions)
+
     def has_doubt(self, codes: Collection[DoubtCode]) -> bool:
         """Return whether an image is doubted for one of some reasons."""
         return any(doubt.code in codes for doubt in self.doubts)
@@ -118,7 +124,7 @@ def advice(
     found = _of_effort(case)
     if not models and strongest >= ENOUGH:
         return (*found, Advice(_why_no_model(context)))
-    if lost or case.doubts or case.moves:
+    if lost or case.doubts or case.moves or case.is_contradicted:
         for rule in RULES:
             found += rule(case)
     return tuple(found)
@@ -209,6 +215,30 @@ def _of_fitting_focal(case: _Case) -> list[Advice]:
     return [Advice(why, _anew(case.context, "--focal-length-px", fitting_px))]
 
 
+def _of_principal_point(case: _Case) -> list[Advice]:
+    """Return the command without given principal points that the points contradict."""
+    contradictions = case.model.principal_point_contradictions
+    inputs = case.inputs
+    if not (inputs and contradictions):
+        return []
+    context = case.context
+    fitting_px = ",".join(f"{part:.0f}" for part in contradictions[0].fitting_px)
+    why = f"the given principal point does not fit, about {fitting_px} px does"
+    cameras = inputs.cameras
+    if inputs.from_database:
+        return [Advice(f"{why}: correct it in {inputs.from_database}", _anew(context))]
+    if cameras.cameras_path:
+        return [Advice(f"{why}: correct it in {cameras.cameras_path}", _anew(context))]
+    if not cameras.params:
+        free = _anew(context, without=["--principal-point"])
+        return [Advice(f"{why}; without it mapping finds it", free)]
+    # Parameters say all of a camera; what they say of the focal length may be right.
+    focal_px = read_given_cameras(cameras)[""].mean_focal_px
+    focal = ["--focal-length-px", f"{focal_px:g}"]
+    free = _anew(context, *focal, without=["--camera-params"])
+    return [Advice(f"{why}; with the focal length alone mapping finds it", free)]
+
+
 def _of_other_recipe(case: _Case) -> list[Advice]:
     model = case.model
     helped = case.lost or [
@@ -274,6 +304,7 @@ def _of_more_photographs(case: _Case) -> list[Advice]:
 
 RULES: Sequence[Callable[[_Case], list[Advice]]] = (
     _of_fitting_focal,
+    _of_principal_point,
     _of_other_recipe,
     _of_tie_points,
     _of_bridges,
@@ -336,8 +367,17 @@ def _without(command: Sequence[str], flags: Collection[str]) -> list[str]:
     return kept
 
 
-def _anew(context: Context, *words: str) -> str:
-    """Return a command for other options, which take the place of those that were given."""
+def _anew(context: Context, *words: str, without: Collection[str] = ()) -> str:
+    """Return a command for other options, which take the place of those that were given.
+
+    Args:
+        context: has the command that was given.
+        words: flags with their values.
+        without: flags that are left out with their values.
+
+    Returns:
+        The command, with a new output folder.
+    """
     path = context.workspace.path
     numbered = (
         path.with_name(f"{path.name}-{number}") for number in itertools.count(2)
@@ -347,7 +387,8 @@ def _anew(context: Context, *words: str) -> str:
         "--output-path",
         str(next(place for place in numbered if not place.exists())),
     )
-    return shlex.join([*_without(_run_command(context), new[::2]), *new])
+    kept = _without(_run_command(context), [*new[::2], *without])
+    return shlex.join([*kept, *new])
 
 
 def _run_command(context: Context) -> Sequence[str]:

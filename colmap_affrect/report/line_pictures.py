@@ -21,6 +21,11 @@ from colmap_affrect.geometry.vanishing import CHANCE
 from colmap_affrect.images import reading
 from colmap_affrect.images.lines import lines_of
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.image_failures import (
+    ImageFailure,
+    failure_of,
+    failures_to_mapping,
+)
 from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.outputs import fitting_name, new_results
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
@@ -45,10 +50,15 @@ class LineReports(Summarized):
 
     photographs: dict[str, LineReport] = field(default_factory=dict)
     """What lines say, by path."""
-    failures: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, ImageFailure] = field(default_factory=dict)
     """Why photographs cannot be read, by path."""
     pictures: dict[str, Path] = field(default_factory=dict)
     """What was drawn, by path of the photograph."""
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why photographs cannot be read, in words without their paths."""
+        return {name: why.what() for name, why in self.failed.items()}
 
     def summary(self) -> str:
         """Return a line for each photograph."""
@@ -68,6 +78,7 @@ class LineReports(Summarized):
                 name: asdict(one) for name, one in self.photographs.items()
             },
             "failures": self.failures,
+            "failed": failures_to_mapping(self.failed),
             "pictures": {name: str(path) for name, path in self.pictures.items()},
         }
 
@@ -127,7 +138,7 @@ def report_lines(
             gray = read_gray(path)
         except ImageError as error:
             logger.warning("%s", with_flags(error.words))
-            found.failures[str(path)] = with_flags(error.what)
+            found.failed[str(path)] = failure_of(error)
             continue
         lines = lines_of(gray)
         report = line_report(lines, (gray.shape[1], gray.shape[0]))

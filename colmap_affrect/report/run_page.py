@@ -208,7 +208,9 @@ def _content(
         "why_no_model": _why_no_model(report),
         "reasons": groups_of(names, report.models, report.unregistered),
         "after_next_run": _command_to_compare(report.output_path),
-        "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
+        "notes": [
+            f"{name}: {why}" for name, why in report.warnings_with_flags().items()
+        ],
         "max_num_lines": MAX_LINES,
         "max_num_named": MAX_NUM_NAMED,
         "cards": [_card(name, report, photographs[name]) for name in names],
@@ -245,8 +247,9 @@ def _card(name: str, report: RunReport, photograph: PhotographReport) -> Card:
     if photograph.model is None:
         why = report.unregistered.get(name)
         text = why.text() if why else FATES["not_registered"]
-        if name in report.failures:
-            text += f": {report.failures[name]}"
+        for stage in report.stages:
+            if name in stage.failed:
+                text += f": {stage.failed[name].text()}"
         return Card(name, "missing", text, ("all", "missing"))
     model = report.models[photograph.model]
     texts = [str(kind)]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import shutil
 import sys
 import tomllib
@@ -10,9 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tomli_w
+from damaged import execute
 from results import tree
 from small_scene import write_photographs
 from verified import CAMERAS
@@ -20,7 +24,9 @@ from verified import CAMERAS
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Finding, diagnose
+from colmap_affrect.errors import OptionError
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.pipeline.single_stages import choose_pairs
 from colmap_affrect.project.record import ModelInputs
 from colmap_affrect.project.workspace import Workspace
 
@@ -145,6 +151,117 @@ def test_what_is_broken_in_a_folder_is_the_one_finding(
     assert found.where == expected.where.format(**places)
     assert expected.what in found.what
     assert expected.advice.format(**places) in found.advice
+
+
+def in_the_place_of(path: Path, kind: str) -> None:
+    """Put something else in the place of a file or a folder."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+        (path / "mine.txt").write_text("mine")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "huge":
+        with path.open("wb") as file:
+            file.truncate(HUGE_BYTES)
+    elif kind == "picture":
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
+    else:
+        path.write_text('{"a": [1, {"b": null}]}')
+
+
+HUGE_BYTES = 1 << 33  # of holes, which take no room on the disk
+READ = (
+    "features.h5", "matches.h5", "database.db", "pairs.txt", "config.toml", "cameras.json",
+    "sparse/0/rigs.bin", "sparse/0/summary.json",
+)  # fmt: skip
+"""What doctor reads, and what is refused where it is something else."""
+KINDS = ("folder", "pipe", "huge", "picture", "other JSON")
+REPLACED = ("report.json", "report.html", "run.log", "database.db.seal", "mapped.db")
+"""What is only written anew: a folder in its place would end commands at that point."""
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize(("name", "kind"), [
+    (name, kind)
+    for name, kind in itertools.product(READ, KINDS)
+    if (name, kind) != ("sparse/0/rigs.bin", "huge")  # its digest takes long
+])  # fmt: skip
+def test_whatever_is_in_the_place_of_a_file_is_found(
+    folders: Folders, name: str, kind: str
+) -> None:
+    in_the_place_of(folders.out / name, kind)
+    before = (folders.out / "run.log").read_bytes()
+    found = [one for one in findings(folders.out) if one.severity == "error"]
+    place = name.removesuffix("/rigs.bin").removesuffix("/summary.json")
+    assert any(place in f"{one.where} {one.what}" for one in found), found
+    assert "memory" not in " ".join(one.what for one in found)
+    assert (folders.out / "run.log").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", REPLACED)
+def test_folder_in_the_place_of_a_file_is_found_and_never_removed(
+    folders: Folders, name: str
+) -> None:
+    in_the_place_of(folders.out / name, "folder")
+    (found,) = findings(folders.out)
+    assert (found.severity, found.where) == ("error", str(folders.out))
+    assert found.what == f"{name}: is a folder, in the place of a file"
+    with pytest.raises(OptionError, match="is a folder, in the place of a file"):
+        run(folders.photos, folders.out, RunOptions(cameras=CAMERAS), overwrite=True)
+    assert (folders.out / name / "mine.txt").read_text() == "mine"
+
+
+def test_file_in_the_place_of_a_folder_is_found(folders: Folders) -> None:
+    in_the_place_of(folders.out / "sparse", "picture")
+    whats = [one.what for one in findings(folders.out)]
+    assert "sparse: is a file, in the place of a folder" in whats
+
+
+def declare(path: Path, name: str, shape: tuple[int, ...]) -> None:
+    """Declare an array of a store in the place of that which is there, without values."""
+    with h5py.File(path, "r+") as file:
+        keys: list[str] = []
+        file.visit(lambda key: keys.append(key) if key.endswith(name) else None)
+        del file[keys[0]]
+        chunks = tuple(min(size, 64) for size in shape)
+        file.create_dataset(keys[0], shape, "f4", chunks=chunks)
+
+
+@pytest.mark.parametrize(
+    "shape", [(1 << 40, 2), (3000, 3000, 3000, 3000), (90_000_000, 2)]
+)
+@pytest.mark.parametrize(("store", "name"), [
+    ("features.h5", "/keypoints"), ("features.h5", "/lafs"), ("matches.h5", "/matches0"),
+])  # fmt: skip
+def test_array_of_an_absurd_size_is_damage_and_no_lack_of_memory(
+    folders: Folders, store: str, name: str, shape: tuple[int, ...]
+) -> None:
+    declare(folders.out / store, name, shape)
+    (found,) = findings(folders.out)
+    assert found.where == str(folders.out / store)
+    assert f"damaged ({name[1:]} of shape {shape}" in found.what
+    assert "'" in found.advice  # names a command that makes it again
+
+
+def test_features_of_another_run_are_found(folders: Folders) -> None:
+    double = "UPDATE keypoints SET rows = 2 * rows, data = data || data"
+    execute(folders.database, f"{double} WHERE image_id = 1")
+    found = [one for one in findings(folders.out) if "fewer features than" in one.what]
+    (finding,) = found
+    assert finding.where == str(folders.out / "features.h5")
+    assert finding.what == "has fewer features than database.db of a.png"
+    assert "extract" in finding.advice
+
+
+def test_stages_that_are_to_be_done_again_are_no_fault(folders: Folders) -> None:
+    assert folders.database.exists()
+    choose_pairs(folders.out, overwrite=True)
+    assert not folders.database.exists()
+    assert findings(folders.out) == []
 
 
 def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.escalation import alternatives, map_and_rematch
 from colmap_affrect.escalation.alternatives import (
+    SCORE,
     Choice,
     adopt_chosen_models,
     choose_learned,
@@ -39,6 +42,7 @@ from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.project.match_state import Begun, LearnedModels
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.sealed_json import write_sealed
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.session.context import Context
@@ -544,3 +548,20 @@ def interrupted_at_third_call() -> Callable[[Escalation], None]:
         written(escalation)
 
     return write
+
+
+def test_an_edited_score_of_the_best_models_does_not_count(tmp_path: Path) -> None:
+    context = Mock()
+    context.workspace.best = tmp_path
+    context.matches.state.listed = "pairs"
+    context.by_hand.digest.return_value = "by hand"
+    kept = {"of_set": "pairs by hand", "num_right_poses": 2.5}
+    write_sealed(tmp_path / SCORE, json.dumps(kept))
+    assert num_right_poses_of_best(context) == 2.5
+    text = (tmp_path / SCORE).read_text(encoding="utf-8")
+    for edited in ("1e9", "NaN", "Infinity", '"x"', "[]"):
+        (tmp_path / SCORE).write_text(text.replace("2.5", edited), encoding="utf-8")
+        assert num_right_poses_of_best(context) == 0.0
+    context.matches.state.listed = "others"
+    write_sealed(tmp_path / SCORE, json.dumps(kept))
+    assert num_right_poses_of_best(context) == 0.0

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from mapping_tasks import mapper_of, synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers import given_principal_points
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.given_principal_points import contradicted_principal_points
 from colmap_affrect.mappers.mapping import map_database
@@ -91,6 +94,57 @@ def test_a_wrong_focal_length_is_not_laid_to_the_principal_point(
     for camera in model.cameras.values():
         camera.focal_length *= 1.3
     assert not contradicted_principal_points(model, task_of(path, model, ALL))
+
+
+@pytest.fixture
+def adjusted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Have five photographs make a large set; say how many were adjusted each time."""
+    numbers = list[int]()
+    adjust = given_principal_points._adjust
+
+    def recorded(model: pycolmap.Reconstruction, priors: Any) -> float:
+        numbers.append(model.num_reg_images())
+        return adjust(model, priors)
+
+    monkeypatch.setattr(given_principal_points, "_adjust", recorded)
+    monkeypatch.setattr(given_principal_points, "MAX_TRIAL_IMAGES", 4)
+    return numbers
+
+
+@pytest.mark.parametrize(("moved", "is_named"), [(0.2, True), (0.0, False)])
+def test_of_a_large_set_a_part_is_adjusted_and_all_are_judged(
+    tmp_path: Path, adjusted: list[int], moved: float, *, is_named: bool
+) -> None:
+    path = tmp_path / "database.db"
+    model = write_database(path)
+    move_principal_points(model, moved)
+    before = {image.name: image.num_points3D for image in model.images.values()}
+    found = contradicted_principal_points(model, task_of(path, model, ALL))
+    assert set(adjusted) == {4}
+    assert len(found) == is_named
+    for one in found:
+        assert one.turns_deg.keys() == before.keys()
+        turns_deg = list(one.turns_deg.values())
+        usual = pytest.approx(float(np.median(turns_deg)), rel=0.01)
+        assert min(turns_deg) > 0.0
+        assert sum(turn_deg == usual for turn_deg in turns_deg) >= 2  # not in the part
+        assert one.fitting_px == pytest.approx(MIDDLE_PX, abs=60.0)
+    assert {i.name: i.num_points3D for i in model.images.values()} == before
+
+
+def test_of_a_large_set_each_given_point_is_judged_by_photographs_of_its_own(
+    tmp_path: Path, adjusted: list[int]
+) -> None:
+    path = tmp_path / "database.db"
+    model = write_database(path)
+    wrong = sorted(model.cameras)[-2:]
+    for key in wrong:
+        model.cameras[key].principal_point_y += 0.2 * max(SIZE)
+    (one,) = contradicted_principal_points(model, task_of(path, model, ALL))
+    names = {i.name for i in model.images.values() if i.camera_id in wrong}
+    assert one.turns_deg.keys() == names
+    assert max(adjusted) == 4
+    assert len(adjusted) <= 4 * given_principal_points.MAX_NUM_SAMPLES
 
 
 def summary_with(path: Path, moved: float) -> ModelSummary:

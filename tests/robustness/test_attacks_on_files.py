@@ -196,6 +196,22 @@ def test_line_of_any_length_is_looked_through_at_once(
     assert len(ended.errors[0]) < 2100
 
 
+def test_comment_of_any_length_hides_no_pair(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    comment = "# a.png c.png " * 2000
+    path.write_text(f"{comment}\na.png b.png\n{' ' * 20_000}\nb.png c.png\n")
+    pairs = read_pairs(path, ["a.png", "b.png", "c.png"])
+    assert list(pairs) == [("a.png", "b.png"), ("b.png", "c.png")]
+
+
+def test_list_without_line_ends_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    with path.open("wb") as file:
+        file.truncate(1 << 33)  # of holes: to read them takes minutes
+    with pytest.raises(AffrectError, match=r"line 1: .* is not two names of images"):
+        read_pairs(path, ["a.png", "b.png"])
+
+
 def test_list_that_repeats_a_name_asks_for_it_once(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,6 +28,7 @@ from colmap_affrect.colmap.cameras import read_camera_records, write_camera_reco
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers.base import ImageFeatures
 from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors
@@ -38,6 +39,7 @@ from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import (
     Bridge,
     MatchedAgain,
+    PrincipalPointContradiction,
     ReconstructionReport,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -246,6 +248,35 @@ def test_focal_lengths_are_advised_where_they_are_unknown_or_contradicted(
     contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
     found = adviser.commands([LOST], taken_out={LOST: (contradicted,)})
     assert found[0] == adviser.anew("--focal-length-px 8")
+
+
+@pytest.mark.parametrize(("cameras", "given", "kept"), [
+    ({"principal_point": "1,2"}, "--principal-point 1,2", ""),
+    ({"model": "PINHOLE", "params": "400,500,1,2"}, "--camera-params=400,500,1,2",
+     "--focal-length-px 450"),
+    ({"cameras_path": "table.csv"}, "--cameras-path table.csv", "--cameras-path table.csv"),
+])  # fmt: skip
+def test_a_given_principal_point_that_does_not_fit_is_left_open(
+    adviser: Adviser,
+    monkeypatch: pytest.MonkeyPatch,
+    cameras: dict[str, str],
+    given: str,
+    kept: str,
+) -> None:
+    inputs = adviser.context.inputs.changed(cameras=CameraOptions(**cameras))
+    monkeypatch.setattr(Context, "inputs", inputs, raising=False)
+    words = tuple(shlex.split(f"{AGAIN} {given}"))
+    asked = Adviser(replace(adviser.context, command=words), adviser.model)
+    one = PrincipalPointContradiction((1.0, 2.0), (511.6, 383.9), {LOST: 4.0})
+    (command,) = asked.commands([], principal_point_contradictions=(one,))
+    assert command == asked.anew(kept).replace("  ", " ")
+    (found,) = advice(
+        asked.context,
+        [],
+        [replace(asked.model, principal_point_contradictions=(one,))],
+        0,
+    )
+    assert "about 512,384 px does" in found.why
 
 
 def test_masks_and_rejected_pairs_are_advised_where_matches_contradict_a_pose(
