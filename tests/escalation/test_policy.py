@@ -224,3 +224,38 @@ def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
     assert "learned" not in kinds
     assert kinds["measured, all tilts"].num_pairs == 7
     assert kinds["measured, all tilts"].core_s > 0.0
+
+
+@pytest.mark.parametrize(
+    ("number", "needless_after"), [(1, [1, 3]), (2, [2, 4]), (3, [3]), (4, [4])]
+)
+def test_a_level_is_needless_after_itself_and_later_ones_with_frames_as_its_own(
+    number: int, needless_after: list[int]
+) -> None:
+    """Frames of the first and the third level are measured, those of the others learned."""
+    bits = sum(1 << later for later in needless_after)
+    assert situation().needless_after(number) == bits
+
+
+def test_the_level_that_saves_most_photographs_per_second_comes_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pairs = [("a", "d")]
+    steps = {
+        1: Step(1, pairs, 2.0, 50.0, all_photographs=2.0, all_seconds=60.0),
+        2: Step(2),
+        3: Step(3, pairs, 1.0, 10.0, all_photographs=1.0, all_seconds=25.0),
+        4: Step(4, pairs, 9.0, 1.0, all_photographs=0.1, all_seconds=7.0),  # no hope
+    }
+
+    def best_step(_: Situation, number: int, budget_s: float) -> Step:
+        assert budget_s == 120.0
+        return steps[number]
+
+    monkeypatch.setattr(Situation, "best_step", best_step)
+    plan = next_step(situation(), "normal")
+    assert plan.step is steps[3]
+    assert plan.left_s == 85.0
+    slow = replace(steps[1], all_seconds=1000.0)
+    monkeypatch.setitem(steps, 1, slow)
+    assert next_step(situation(), "normal").left_s == 120.0
