@@ -207,3 +207,35 @@ def test_a_collage_ties_two_images_or_more_to_others(
     found = set[int]()
     assert _cut_at_collages(place, overlaps, views, found) == parts
     assert found == collages
+
+
+@pytest.mark.parametrize(("num_common", "differ"), [(0, True), (1, True), (4, False)])
+def test_regions_of_an_image_differ_that_have_a_tenth_of_their_cells_in_common(
+    num_common: int, *, differ: bool
+) -> None:
+    """An image shares 20 cells with a second one, and 30 cells with a third one."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", FOCAL_PX, WIDTH, HEIGHT
+    )
+    model.add_camera_with_trivial_rig(camera)
+    columns = (np.arange(64) % 8 + 0.5) * WIDTH / 8
+    rows = (np.arange(64) // 8 + 0.5) * HEIGHT / 8
+    one_in_each_cell = np.stack([columns, rows], axis=1)
+    for image_id in (1, 2, 3):
+        image = pycolmap.Image(f"{image_id}.jpg", one_in_each_cell, 1, image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    seen_by_second = range(20)
+    seen_by_third = range(20 - num_common, 50 - num_common)
+    for cell in range(64):
+        track = pycolmap.Track()
+        track.add_element(1, cell)
+        if cell in seen_by_second:
+            track.add_element(2, cell)
+        if cell in seen_by_third:
+            track.add_element(3, cell)
+        model.add_point3D(np.ones(3), track)
+    views = _Views(model)
+    assert views.regions_differ(1, {2}, {3}) == differ
+    assert views.regions_differ(1, {3}, {2}) == differ
+    assert not views.regions_differ(1, {2}, set())
