@@ -123,6 +123,27 @@ def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> N
     )
 
 
+def test_learned_matching_of_a_large_set_has_the_time_that_it_has_not_taken_yet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names, weights=names)
+    states = dict(large.states)
+    states[names[0], names[1]] = PairState(0, 3, tried=1 | 1 << LEARNED)
+    large = replace(large, states=states)
+    asked = dict[str, float]()
+
+    def best_step(_: Situation, number: int, budget_s: float) -> Step:
+        asked[kind_of(LEVELS[number])] = budget_s
+        return Step()
+
+    monkeypatch.setattr(Situation, "best_step", best_step)
+    learned_step(large)
+    statistics = statistics_of(LEVELS[LEARNED])
+    spent_s = 2 * statistics.image_s + statistics.pair_s
+    assert asked == {"learned": pytest.approx(large.first_model_s - spent_s)}
+
+
 def done_with_learned(**given: Any) -> Situation:
     """All pairs were matched by networks, beside what is there."""
     before = situation(**given)
@@ -148,6 +169,16 @@ def test_learned_level_of_a_large_set_is_a_step_of_its_own() -> None:
     assert next_step(situation(names, weights=names), "low").step.level == LEARNED
 
 
+def test_learned_level_of_a_large_set_is_tried_and_told_as_others_are() -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names, weights=names)
+    assert "learned" in {one.kind for one in untried(large)}
+    spent = dict.fromkeys(large.states, PairState(0, 3, tried=0b1001))
+    plan = next_step(replace(large, states=spent), "low")
+    assert plan.step.level == LEARNED
+    assert plan.left_s == pytest.approx(large.first_model_s)
+
+
 def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> (
     None
 ):
@@ -155,6 +186,7 @@ def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one(
     assert normal.budget_s(1.0, has_model=True) == normal.least_s == 120.0
     assert normal.budget_s(1000.0, has_model=True) == 1000.0
     assert normal.budget_s(1.0, has_model=False) == normal.without_model_s == 900.0
+    assert normal.budget_s(1000.0, has_model=False) == 1000.0
     times = [
         EFFORTS[name].budget_s(1000.0, has_model=True)
         for name in ("low", "normal", "high")

@@ -224,3 +224,18 @@ def test_most_shapes_that_were_measured_one_by_one_differ(
     # Steps of 3e-4 of shapes of unit area.
     shapes[:num_measured, 1, 0] = 3e-4 * np.arange(num_measured)
     assert are_individual_shapes(shapes) == expected
+
+
+def test_shapes_without_a_tilt_are_covered_from_the_start() -> None:
+    """Of a hundred shapes 97 or 90 are not tilted, and 95 are to be covered."""
+    for num_tilted, num_centers in ((3, 0), (10, 1)):
+        tilts = np.repeat([1.0, 4.0], [100 - num_tilted, num_tilted])
+        cover = cover_shapes(
+            metrics_from_tilts(tilts, np.full(100, 0.5)),
+            np.ones(100),
+            radius=RADIUS,
+            max_tilt=5.8,
+            covered_frac=0.95,
+            max_num_centers=8,
+        )
+        assert len(cover.centers) == num_centers

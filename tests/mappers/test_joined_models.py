@@ -1,4 +1,4 @@
-"""Two models are joined by tie points that agree on one similarity, up to a tenth of their spread."""
+"""Two models are joined by tie points that agree on one similarity."""
 
 from __future__ import annotations
 

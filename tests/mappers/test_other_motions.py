@@ -172,7 +172,7 @@ def test_matches_contradict_a_model_that_are_half_as_far_again_as_those_that_agr
     random = np.random.default_rng(3)
     points = random.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 9.0), (120, 3))
     first = CAMERA.img_from_cam(points)
-    second = CAMERA.img_from_cam(points + [0.5, 0.0, 0.0])
+    second = CAMERA.img_from_cam(points + np.array([0.5, 0.0, 0.0]))
     second[:60, 1] += np.sqrt(2.0) * error_px  # Sampson's error is of both images
     rows = np.stack([np.arange(120)] * 2, axis=1)
     graph: Any = SimpleNamespace(

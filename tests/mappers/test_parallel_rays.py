@@ -30,7 +30,7 @@ def test_rays_that_part_agree_with_a_pose_up_to_one_degree(
     angle_deg: float, *, agrees: bool
 ) -> None:
     shift_px = FOCAL_PX * np.tan(np.radians(angle_deg))
-    points = MIDDLE, MIDDLE + [shift_px, 0.0]
+    points = MIDDLE, MIDDLE + np.array([shift_px, 0.0])
     found = compared_with_pose(TO_THE_RIGHT, (CAMERA, CAMERA), points)
     assert found.depths.angles_deg == pytest.approx(abs(angle_deg))
     assert found.depths.in_front.tolist() == [angle_deg > 0.0]

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.camera_priors import CameraPrior
 from colmap_affrect.mappers.search import Search
 
