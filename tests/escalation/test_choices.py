@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_affrect.escalation import alternatives
+from colmap_affrect.escalation import alternatives, escalate
 from colmap_affrect.escalation.alternatives import (
     SCORE,
     _choice_of_learned_matches,
@@ -197,6 +197,65 @@ def test_the_worth_of_the_best_measured_matches_is_kept_in_mind(
     before = PairState(20, 5, level=level_before, measured_worth=(15, 2))
     found = escalation._measured_worths([trial(worth, before, level)])
     assert found == expected
+
+
+@pytest.mark.parametrize(("num_inliers", "worth"), [(7, (7, 0)), (0, (0, 6))])
+def test_a_pair_is_worth_its_inliers_or_else_its_consistent_matches(
+    num_inliers: int,
+    worth: tuple[int, int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context = context_in(tmp_path)
+    context.features.read_frames = lambda name: name
+    monkeypatch.setattr(escalate, "num_confirming", lambda *_: 6)
+    verifier: Any = SimpleNamespace(inliers=lambda *_: [(0, 1)] * num_inliers)
+    escalation = escalation_of(context)
+    assert escalation._worth(matches_of("a", "b", 1), verifier) == worth
+
+
+def test_learned_matches_are_used_of_the_level_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = escalation_of(context_in(tmp_path))
+    learned = {
+        ("a", "b"): Learned(matches_of("a", "b", 2), (50, 0)),
+        ("b", "c"): Learned(matches_of("b", "c", 4), (60, 0)),
+    }
+    stores: Any = escalation.matches
+    stores.learned = lambda _: learned
+    before = PairState(20, 5)
+    monkeypatch.setattr(
+        escalation.state, "states", lambda: dict.fromkeys(learned, before)
+    )
+    kept = list[tuple[Any, int]]()
+    monkeypatch.setattr(
+        escalation, "_keep", lambda trials, level: kept.append((trials, level))
+    )
+    assert escalation._use_learned_matches([*learned], 2) == {("a", "b")}
+    expected = Trial(learned["a", "b"].matches, (50, 0), before)
+    assert kept == [([expected], 2)]
+    assert escalation._use_learned_matches([*learned], 3) == set()
+
+
+def test_pairs_that_have_learned_matches_are_not_matched_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = (("a", "b"), ("b", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    context.deadline_s = float("inf")
+    escalation = escalation_of(context)
+    stores: Any = escalation.matches
+    stores.learned_levels = lambda _: {("a", "b"): 2, ("b", "c"): -1}
+    matched = list[tuple[Any, int]]()
+    monkeypatch.setattr(
+        escalation,
+        "_match_with",
+        lambda batch, level, _: matched.append((batch, level)),
+    )
+    monkeypatch.setattr(escalation, "write", lambda: None)
+    assert escalation.match_learned() == 1
+    assert matched == [([("b", "c")], 2)]
 
 
 def test_images_get_the_features_that_they_lack_of_a_level_and_of_its_base(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from line_scenes import SIZE, Building, arch_edges, chance_edges, turn
@@ -322,3 +324,26 @@ def test_segments_are_of_one_line_where_either_one_says_so() -> None:
     middles = np.array([[0.0, 0.0], [0.9, 0.005]])
     segments = Segments(middles - directions, middles + directions)
     assert_allclose(segments.weights, [0.5, 0.5])
+
+
+def test_focal_lengths_are_as_likely_as_all_distortions_make_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Segments err together: three nats of them count as one."""
+    turns = np.tile(np.eye(3), (len(FOCALS), 1, 1))
+    of_others = np.where(np.arange(len(FOCALS)) == 5, 6.0, 0.0)
+
+    def refined_at_once(*given: Any) -> tuple[Array, Array]:
+        return given[1], np.full(len(given[1]), 3.0)
+
+    monkeypatch.setattr(line_cameras, "refined", refined_at_once)
+    monkeypatch.setattr(
+        line_cameras,
+        "_likeliest_lens",
+        lambda *_: line_cameras._Lens(0.0, turns, of_others),
+    )
+    edges = np.array([[10.0, 10.0, 10.0, 20.0 + number] for number in range(20)])
+    found = line_cameras.line_likelihood(Segments.of_image(edges, SIZE))
+    assert found is not None
+    assert_allclose(found.log_likelihoods[5], 3.0)
+    assert_allclose(np.delete(found.log_likelihoods, 5, axis=0), 1.0)

@@ -14,6 +14,7 @@ from colmap_affrect.geometry.parallax import (
     Size,
     correlation,
     mirrored_share,
+    pure_rotation_ratio,
     same_view_homography,
     text_line_matches,
 )
@@ -148,3 +149,29 @@ def test_medians_are_those_of_numpy() -> None:
     rows = np.random.default_rng(0).normal(size=(5, 8))
     assert_allclose(parallax._medians(rows), np.median(rows, axis=1))
     assert_allclose(parallax._medians(rows[:, 1:]), np.median(rows[:, 1:], axis=1))
+
+
+def test_a_camera_that_turns_and_zooms_may_have_images_of_two_sizes() -> None:
+    """Image 2 is larger, and of a lens that is one and a half times as long."""
+    sizes: tuple[Size, Size] = ((640, 480), (1000, 900))
+    random = np.random.default_rng(6)
+    points1 = random.uniform((150, 100), (490, 380), (200, 2))
+    rays = np.column_stack([(points1 - (320, 240)) / 640.0, np.ones(200)])
+    turned = rays.copy()
+    turned[:, :2] = rays[:, :2] @ rotation(0.3).T
+    turned[:, 1] += 0.02  # a small turn about x
+    points2 = 1.5 * 640.0 * turned[:, :2] / turned[:, 2:] + (500, 450)
+    assert pure_rotation_ratio(points1, points2, sizes, 4.0) > 0.95
+    assert pure_rotation_ratio(points1, points2[::-1], sizes, 4.0) < 0.3
+
+
+def test_where_one_image_shows_nothing_windows_do_not_correlate() -> None:
+    """Two thirds of the second image are painted over."""
+    random = np.random.default_rng(5)
+    rough = random.uniform(0, 255, (40, 60)).astype(np.uint8)
+    gray = cv2.resize(rough, (300, 200), interpolation=cv2.INTER_LINEAR)
+    painted = gray.copy()
+    painted[:, 100:] = 128
+    assert correlation(gray, gray, np.eye(3)) > 0.9
+    assert correlation(gray, painted, np.eye(3)) < 0.2
+    assert correlation(painted, gray, np.eye(3)) < 0.2
