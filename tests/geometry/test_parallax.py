@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry import parallax
 from colmap_affrect.geometry.affine import project, rotation
 from colmap_affrect.geometry.arrays import Array, Bytes
@@ -154,14 +155,15 @@ def test_medians_are_those_of_numpy() -> None:
 def test_a_camera_that_turns_and_zooms_may_have_images_of_two_sizes() -> None:
     """Image 2 is larger, and of a lens that is one and a half times as long."""
     sizes: tuple[Size, Size] = ((640, 480), (1000, 900))
-    random = np.random.default_rng(6)
-    points1 = random.uniform((150, 100), (490, 380), (200, 2))
-    rays = np.column_stack([(points1 - (320, 240)) / 640.0, np.ones(200)])
-    turned = rays.copy()
-    turned[:, :2] = rays[:, :2] @ rotation(0.3).T
-    turned[:, 1] += 0.02  # a small turn about x
-    points2 = 1.5 * 640.0 * turned[:, :2] / turned[:, 2:] + (500, 450)
-    assert pure_rotation_ratio(points1, points2, sizes, 4.0) > 0.95
+    focal_px = 0.63 * 640.0
+    x, y = np.meshgrid(np.linspace(60, 580, 15), np.linspace(40, 440, 13))
+    points1 = np.stack([x.ravel(), y.ravel()], axis=1)
+    rays = np.column_stack([(points1 - (320, 240)) / focal_px, np.ones(len(points1))])
+    roll = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.3]))
+    turn = pycolmap.Rotation3d(np.array([0.2, 0.0, 0.0])) * roll
+    turned = rays @ turn.matrix().T
+    points2 = 1.5 * focal_px * turned[:, :2] / turned[:, 2:] + (500, 450)
+    assert pure_rotation_ratio(points1, points2, sizes, 4.0) > 0.9
     assert pure_rotation_ratio(points1, points2[::-1], sizes, 4.0) < 0.3
 
 
