@@ -12,11 +12,13 @@ from wall_scene import views, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, pose_errors, relative_pose
+from colmap_affrect.geometry.two_views import ScaleEstimate
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.bridging import (
     BridgeFinder,
     BridgeHypothesis,
+    _OpenPair,
     _PosedModel,
 )
 from colmap_affrect.mappers.camera_priors import camera_priors
@@ -157,6 +159,28 @@ def test_pairs_say_whether_a_bridge_is_right_by_the_roots_of_their_matches(
     finder = BridgeFinder(graph, nothing, SEED)
     found = finder._agreeing_weight(posed, 5, nothing, nothing)
     assert found == (None if weight is None else pytest.approx(weight))
+
+
+def test_a_bridge_ranks_by_the_pairs_and_the_depths_that_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph: Any = SimpleNamespace(names={1: "one.jpg"})
+    nothing: Any = None
+    finder = BridgeFinder(graph, nothing, SEED)
+    relative = SimpleNamespace(pose=(np.eye(3), np.array([1.0, 0.0, 0.0])))
+    scale = ScaleEstimate(2.0, num_agreeing=12, num_ratios=16, error_frac=0.01)
+    monkeypatch.setattr(finder, "_poses_of_pair", lambda *_: [relative])
+    monkeypatch.setattr(finder, "_scale", lambda *_: scale)
+    monkeypatch.setattr(finder, "_agreeing_weight", lambda *_: 8.0)
+    posed: Any = SimpleNamespace(
+        poses={1: (np.eye(3), np.array([0.0, 5.0, 0.0]))}, cameras={1: None}
+    )
+    pair: Any = SimpleNamespace(ids=(1, 5))
+    (found,) = finder._hypotheses(posed, _OpenPair(pair, 0, nothing))
+    assert found.rank == 8.0 * 12 / 16
+    assert found.image_id == 5
+    assert found.bridge == Bridge("one.jpg", 12, 16, 0.01)
+    assert found.pose[1].tolist() == [2.0, 5.0, 0.0]
 
 
 def test_points_behind_a_camera_have_no_known_depth() -> None:
