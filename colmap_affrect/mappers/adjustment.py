@@ -148,7 +148,8 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
         self.focal_px = prior.focal_px
         self.mean: Array = np.zeros(number)
         self.weights: Array = np.zeros(number)
-        self.weights[self.focal] = noise_px / prior.sigma
+        # Two focal lengths of one camera are one observation, as the score counts them.
+        self.weights[self.focal] = noise_px / prior.sigma / math.sqrt(len(self.focal))
         self.weights[list(camera.extra_params_idxs())] = noise_px / DISTORTION_SIGMA
         indices = list(camera.principal_point_idxs())
         center = prior.principal_point or usual_principal_point(camera)

@@ -232,7 +232,10 @@ def camera_prior(
     focal_px = float(camera.mean_focal_length())
     if record and "focal" in record.given:
         return CameraPrior(focal_px, 0.0)
-    if record.source in TRUSTED if record else camera.has_prior_focal_length:
+    is_trusted = camera.has_prior_focal_length
+    if record:
+        is_trusted = record.source in TRUSTED
+    if is_trusted:
         return CameraPrior(focal_px, EXIF_SIGMA)
     longer_px = max(camera.width, camera.height)
     told = [measured for measured in map(measurement_of_lines, lines) if measured]

@@ -94,14 +94,14 @@ def _direction_sigma_deg(
     first_pose = model.images[first].cam_from_world()
     second_pose = model.images[second].cam_from_world()
     rotation: Array = first_pose.rotation.matrix() @ second_pose.rotation.matrix().T
-    center: Array = rotation @ second_pose.translation
-    to_second: Array = first_pose.translation - center
+    carried: Array = rotation @ second_pose.translation
+    to_second: Array = first_pose.translation - carried
     distance = float(np.linalg.norm(to_second))
     if distance == 0.0:
         return math.inf
     jacobian = np.hstack(
         [
-            2.0 * _cross_matrix(center),
+            2.0 * _cross_matrix(carried),
             np.eye(3),
             -2.0 * rotation @ _cross_matrix(second_pose.translation),
             -rotation,

@@ -103,9 +103,10 @@ class ExistingModel:
                 database.update_camera(self.reconstruction.camera(camera_id))
 
     def restore(self, model: pycolmap.Reconstruction) -> None:
-        """Give an extended model the poses that it had before, to the bit, and images it lost.
+        """Move an extended model back onto the poses that it had, and give it images it lost.
 
-        The model as a whole is moved back onto them: COLMAP gives it another scale.
+        COLMAP gives it another scale. Without refinement the poses are those from before, to the
+        bit.
         """
         before = [
             image for image in self.images if model.image(image.image_id).has_pose

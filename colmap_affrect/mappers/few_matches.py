@@ -31,7 +31,7 @@ pair that any wrong matches would not say."""
 MAX_RAW = 30
 """Raw matches of which fewer than 15 inliers can be significant (theory: of more they are not, with
 the usual chance of 3 per cent)."""
-MIN_INLIER_SHARE = 0.8  # of raw matches, which are no few sure ones else (judged)
+MIN_INLIER_SHARE = 0.8  # of raw matches; below, a pair is not trusted (judged)
 MAX_DISAGREEING = 0.1  # share of matches that a third image may contradict (judged)
 
 

@@ -145,8 +145,9 @@ def focal_growths(
 ) -> dict[int, float]:
     """Return by what part the cost grows with another focal length, by id of the camera.
 
-    A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
-    focal length of each uncalibrated camera, while all else may move.
+    A copy with some of the points is adjusted. What its joint covariance leaves open tells the
+    growths. Where there is none, the copy is adjusted again with longer and with shorter focal
+    lengths of uncalibrated cameras, whose other intrinsics are constant, while all else may move.
     """
     cameras = cameras_of(model).values()
     priors = camera_priors(cameras, task.cameras, task.lines)

@@ -4,7 +4,8 @@ A verified pair whose images are both in the model says how many of its inliers 
 poses. Pairs alone leave scales and focal lengths open, so a feature that is matched in two other
 images says whether one point explains all three. The likelihood of such a count is a beta-binomial
 distribution, one for right models and one for wrong ones. The score adds the logarithms of their
-ratios, which allow for pairs that are wrong themselves, and subtracts the costs of focal lengths.
+ratios, which allow for pairs that are wrong themselves, and subtracts the costs of focal lengths
+and principal points.
 More images that agree raise the score; images that agree with nothing do not.
 """
 
@@ -83,8 +84,8 @@ class ModelScorer:
     ) -> dict[int, float]:
         """Return the log-likelihood ratio of each image's features that two others match.
 
-        Right are as many of the grid cells of the image that hold such features as is the share of
-        these features whose point three images see, or more.
+        What is counted are the cells of a grid on the image that hold such features. The share of
+        them that counts as right is that of the features whose point three images see.
 
         Args:
             model: The model.
@@ -171,7 +172,7 @@ def _seen_by_three(
         if image_id in viewpoint_of:
             seen_from[viewpoint_of[image_id]].append(ids)
         else:
-            seen.append(ids)
+            seen.append(np.unique(ids))  # a point may have two keypoints of an image
     for of_images in seen_from.values():
         seen.append(np.unique(np.concatenate(of_images)))
     ids, num_viewpoints = np.unique(np.concatenate([*seen, [-1]]), return_counts=True)

@@ -151,7 +151,7 @@ class PairGraph:
     def of(
         cls, database: pycolmap.Database, min_num_matches: int = MIN_NUM_MATCHES
     ) -> Self:
-        """Read the same from a database that is open."""
+        """Read a database that is open: its verified pairs, without raw matches and shapes."""
         options = pycolmap.DatabaseCacheOptions(
             min_num_matches=min_num_matches, load_all_images=True
         )
@@ -167,7 +167,7 @@ class PairGraph:
         return cls(cache, names, cameras, keypoints, strong, weak, min_num_matches)
 
     def without(self, ids: Collection[Ids]) -> Self:
-        """Leave out some pairs; return the same graph where there are none."""
+        """Return a graph without some pairs; the same one where there are none."""
         if not ids:
             return self
         kept = [pair for pair in self.verified if pair.ids not in ids]
@@ -176,7 +176,7 @@ class PairGraph:
     def _with_few_matches(
         self, few: Iterable[FewMatches], database: pycolmap.Database
     ) -> Self:
-        """Add pairs with few matches, whose keypoints a database has."""
+        """Return a graph with more pairs, of few matches, whose keypoints a database has."""
         verified = [*self.verified]
         keypoints = {**self.keypoints}
         for one in few:

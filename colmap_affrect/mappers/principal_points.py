@@ -2,14 +2,11 @@
 
 Prints are cut off centre, and view cameras shift their lens. A model with constant principal points
 makes up for that by wrong rotations, focal lengths and above all distortion, which keeps it where
-it is once the principal points are free. So the lens is taken for straight at first, and errors
-count from far away, less and less (graduated non-convexity: Blake and Zisserman, Visual
-Reconstruction, 1987). Made-up prints with known cameras are within 0.2 to 3 degrees then, where
-freeing the principal points alone leaves them off by 4 to 8
-(``tests/benchmarks/prints.py``).
+it is once the principal points are free. So lenses are taken for straight at first. Made-up prints
+with known cameras are within 0.2 to 3 degrees then, where freeing the principal points alone
+leaves them off by 4 to 8 (``tests/benchmarks/prints.py``).
 """
 
-import copy
 import math
 from collections import Counter
 from collections.abc import Mapping, Set
@@ -22,6 +19,7 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers.adjustment import MEDIUM
 from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
+    PrincipalPointPrior,
     has_free_center,
     shifted_principal_point,
     usual_principal_point,
@@ -30,19 +28,6 @@ from colmap_affrect.mappers.distortion import straighten
 from colmap_affrect.mappers.focal_observability import with_fewer_points
 from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
-
-NOISE_FACTORS = 12.0, 6.0, 3.0
-"""Multiples of the noise of keypoints, by which errors count at first (resource: a print whose
-principal point is off by a tenth has errors of some ten px). Half of that or twice as much gives
-the same models."""
-USUAL_LIMIT = 2.0
-"""Multiple of the noise that the limits of triangulation and of filters are made for (theory)."""
-ANGLE_LIMITS = (
-    "create_max_angle_error",
-    "continue_max_angle_error",
-    "re_max_angle_error",
-)
-ERROR_LIMITS = "merge_max_reproj_error", "complete_max_reproj_error"
 
 
 def with_free_principal_points(
@@ -98,11 +83,7 @@ def contradict_constant(
     num_observations = with_fewer_points(model).compute_num_observations()
     if not num_observations:
         return False
-    freed = set[int]()
-    for key in used_cameras(model):
-        prior = free.adjuster.priors[key]
-        if prior.principal_point and not constant.adjuster.priors[key].principal_point:
-            freed.add(key)
+    freed = _freed(model, constant, free).keys()
     per_parameter = 0.5 * math.log(num_observations)
     constant_cost = min(constant.costs_of_starts(model))
     crop_cost = min(free.costs_of_starts(model))
@@ -135,26 +116,23 @@ def _only_up_and_down(free: Search, freed: Set[int]) -> Search:
 def with_shifted_axes(
     model: pycolmap.Reconstruction, free: Search, graph: PairGraph
 ) -> pycolmap.Reconstruction:
-    """Return a model with free principal points.
+    """Return a model with free principal points, whose lenses bend where that scores higher.
 
     Args:
         model: With constant principal points; it stays as it is.
         free: The search with free principal points.
         graph: Pairs that the model is made from.
     """
-    changed = pycolmap.Reconstruction(model)
-    straighten(changed, free.adjuster.priors)
-    straight = dict[int, CameraPrior]()
+    priors = dict[int, CameraPrior]()
     for key, prior in free.adjuster.priors.items():
-        straight[key] = replace(
-            prior, has_distortion=prior.has_distortion and prior.has_prior_focal_length
-        )
-    for factor in NOISE_FACTORS:
-        coarse = _coarser(_with_priors(free, straight), factor)
-        changed = coarse.grower(graph).remake(changed, MEDIUM)
-    fine = _with_priors(free, straight)
-    changed = fine.grower(graph).remake(changed, MEDIUM)
-    return free.grower(graph).remake(changed)
+        has_distortion = prior.has_distortion and prior.has_prior_focal_length
+        priors[key] = replace(prior, has_distortion=has_distortion)
+    straight = _with_priors(free, priors)
+    begun = pycolmap.Reconstruction(model)
+    straighten(begun, free.adjuster.priors)
+    changed = straight.grower(graph).remake(begun, MEDIUM)
+    bent = free.grower(graph).remake(changed)
+    return max(changed, bent, key=free.scorer.score)
 
 
 def axis_turns_deg(
@@ -210,27 +188,35 @@ def _rotations(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rotation3d]
     return found
 
 
-def principal_point_cost(model: pycolmap.Reconstruction, search: Search) -> float:
-    """Return how much the free principal points of a model cost, in nats."""
+def freed_principal_point_cost(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> float:
+    """Return how much those principal points cost that were freed, in nats.
+
+    Args:
+        model: With free principal points.
+        constant: The search in which they were constant.
+        free: The search that made the model.
+    """
     total = 0.0
-    for camera in used_cameras(model).values():
-        prior = search.adjuster.priors[camera.camera_id].principal_point
-        if prior:
-            total += prior.cost(camera.principal_point_x, camera.principal_point_y)
+    cameras = used_cameras(model)
+    for key, prior in _freed(model, constant, free).items():
+        camera = cameras[key]
+        total += prior.cost(camera.principal_point_x, camera.principal_point_y)
     return total
 
 
-def _coarser(search: Search, factor: float) -> Search:
-    """Return a search in which keypoints are so many times as noisy, and limits wider."""
-    native = copy.deepcopy(search.native)
-    wider = max(1.0, factor / USUAL_LIMIT)
-    native.mapper.filter_max_reproj_error *= wider
-    for name in (*ANGLE_LIMITS, *ERROR_LIMITS):
-        value = getattr(native.triangulation, name)
-        setattr(native.triangulation, name, value * wider)
-    noise_px = search.adjuster.noise_px * factor
-    adjuster = replace(search.adjuster, noise_px=noise_px)
-    return replace(search, native=native, adjuster=adjuster)
+def _freed(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> dict[int, PrincipalPointPrior]:
+    """Return the priors of the principal points that one search holds and the other frees."""
+    found = dict[int, PrincipalPointPrior]()
+    for key in used_cameras(model):
+        prior = free.adjuster.priors[key].principal_point
+        was_constant = constant.adjuster.priors[key].principal_point is None
+        if prior is not None and was_constant:
+            found[key] = prior
+    return found
 
 
 def _with_priors(search: Search, priors: Mapping[int, CameraPrior]) -> Search:

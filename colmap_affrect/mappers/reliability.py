@@ -280,7 +280,8 @@ def share_within_limit(sigma_deg: float) -> float:
 
 
 def _probability(log_odds: float) -> float:
-    return 1.0 / (1.0 + math.exp(-log_odds))
+    """Return the probability of log odds, of any size."""
+    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
 
 
 def _main_reasons(losses: list[_Loss]) -> tuple[Doubt, ...]:

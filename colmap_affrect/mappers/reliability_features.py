@@ -59,7 +59,7 @@ class ReliabilityFeatures:
 
     log_likelihood_ratio: float
     """Of right against wrong poses, by its pairs, its features that two other images match, and the
-    prior of its focal length."""
+    prior of its camera."""
     agreement: float  # share of the inliers of its pairs that agrees with the model
     num_three_view_points: int  # points that it and two others see
     focal_growth: float

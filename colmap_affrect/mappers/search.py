@@ -131,7 +131,11 @@ class Search:
         grower = search.grower(graph)
         grower.adjust_fully(first)
         grown = search._grown(graph, graph.unexplained_by(first))
-        models = [replace(known[0], reconstruction=first), *known[1:], *grown]
+        models = [replace(known[0], reconstruction=first)]
+        for mapped in known[1:]:
+            copied = pycolmap.Reconstruction(mapped.reconstruction)
+            models.append(replace(mapped, reconstruction=copied))
+        models += grown
         models.sort(key=self._score, reverse=True)
         found = search.with_bridges(graph, models)
         for mapped in found:

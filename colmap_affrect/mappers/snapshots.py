@@ -74,7 +74,7 @@ def largest_snapshot(folder: Path) -> Path | None:
 def drop_old_snapshots(folder: Path) -> None:
     """Remove all but the newest snapshots of the largest models."""
     older = sorted(path for path in folder.iterdir() if path.is_dir())[:-1]
-    # The newest may be not
+    # The newest one may be incomplete.
     complete = [path for path in older if (path / "frames.bin").exists()]
     complete.sort(key=lambda path: ((path / "frames.bin").stat().st_size, path.name))
     remove_own(complete[: -(NUM_KEPT - 1)])

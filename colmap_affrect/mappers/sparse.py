@@ -23,7 +23,7 @@ from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
     contradict_constant,
-    principal_point_cost,
+    freed_principal_point_cost,
     with_free_principal_points,
     with_shifted_axes,
 )
@@ -426,7 +426,8 @@ class _HypothesisTest:
         found = free.with_bridges(search.graph, [changed_model])
         found = with_new_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
-        paid = principal_point_cost(found[0].reconstruction, free)  # by the points
+        # That the points ask for it has paid for the principal points.
+        paid = freed_principal_point_cost(found[0].reconstruction, search, free)
         if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
             self._take(found, score)

@@ -62,8 +62,8 @@ class TieJoiner:
     def join(self, models: Sequence[MappedModel]) -> list[MappedModel]:
         """Return models with all that joins them, and all tie points observed; large ones first.
 
-        Bridges go on from there. Images that their tie points
-        contradict are taken out, and registered again where these allow it.
+        Bridges go on from there. Images that their tie points contradict are taken out, of the
+        given models, too, and registered again where these allow it.
         """
         if not self.points.keypoints:
             return list(models)

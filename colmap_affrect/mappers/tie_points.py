@@ -109,7 +109,7 @@ class TiePoints:
         return found
 
     def misplaced(self, model: pycolmap.Reconstruction) -> list[int]:
-        """Return images that at least half of their tie points, by two other images, contradict."""
+        """Return images that half of their tie points, by two other images, and four contradict."""
         num_points = Counter[int]()
         num_far = Counter[int]()
         for seen in self._seen(model).values():

@@ -7,9 +7,9 @@ with a known model. Usage:
     colmap-affrect compare --image-path out/prints/images \
         --ground-truth-path out/prints/ground_truth --output-path out/prints/compare
 
-With ``--kind crop`` windows lie anywhere in a photograph, with ``shift`` above or below its middle,
-and with ``whole`` around the principal point. Each has a size of its own, so that no two
-photographs have one focal length.
+With ``--kind crop`` windows lie anywhere in a photograph, with ``turned`` they lie askew as well,
+with ``shift`` above or below its middle, and with ``whole`` around the principal point. Each has a
+size of its own, so that no two photographs have one focal length.
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 
 SHARES = 0.6, 0.85  # of the sides of a photograph that are left
+MAX_TURN_DEG = 10.0  # of a print that was laid askew
 MAX_OFFSET = 0.25  # of the axis from the middle of a print, longer sides
 LONGER_SIDE_PX = 1200, 1600  # of a print
 JPEG_QUALITY = 92
+KINDS = "crop", "turned", "shift", "whole"
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def window_of(
     """Return a window that is cut out.
 
     Args:
-        kind: ``crop``, ``shift`` or ``whole``.
+        kind: One of ``KINDS``.
         width: Of the photograph, px.
         height: Of the photograph, px.
         center: Principal point, px.
@@ -59,7 +61,7 @@ def window_of(
         cut = Window(
             left=0.0, top=0.0, width=width * share, height=height * share * aspect
         )
-        across = random.uniform(0.0, 1.0) if kind == "crop" else 0.5
+        across = random.uniform(0.0, 1.0) if kind in ("crop", "turned") else 0.5
         down = random.uniform(0.0, 1.0) if kind != "whole" else 0.5
         left = across * (width - cut.width)
         top = down * (height - cut.height)
@@ -68,6 +70,21 @@ def window_of(
         longer = max(cut.width, cut.height)
         if math.hypot(offset_x, offset_y) <= MAX_OFFSET * longer:
             return Window(left, top, cut.width, cut.height)
+
+
+def _that_stays_inside(cut: Window, turn_rad: float) -> Window:
+    """Return a window around the same middle, so small that it lies inside when it is turned."""
+    cosine = math.cos(turn_rad)
+    sine = abs(math.sin(turn_rad))
+    across = cut.width / (cut.width * cosine + cut.height * sine)
+    down = cut.height / (cut.width * sine + cut.height * cosine)
+    share = min(across, down)
+    return Window(
+        left=cut.left + cut.width * (1.0 - share) / 2.0,
+        top=cut.top + cut.height * (1.0 - share) / 2.0,
+        width=cut.width * share,
+        height=cut.height * share,
+    )
 
 
 def make_prints(
@@ -84,7 +101,7 @@ def make_prints(
         image_path: Folder of the photographs.
         truth_path: Folder of their COLMAP model.
         output_path: Folder that gets ``images`` and ``ground_truth``.
-        kind: ``crop``, ``shift`` or ``whole``.
+        kind: One of ``KINDS``.
         step: Every step-th photograph is taken.
         seed: For all that is left to chance.
     """
@@ -101,16 +118,25 @@ def make_prints(
         center = (camera.principal_point_x * scale, camera.principal_point_y * scale)
         cut = window_of(kind, columns, rows, center, 1000 * seed + number)
         random = np.random.default_rng(2000 * seed + number)
-        zoom = random.uniform(*LONGER_SIDE_PX) / max(cut.width, cut.height)
+        longer_px = random.uniform(*LONGER_SIDE_PX)
+        turn_rad = 0.0
+        if kind == "turned":
+            turn_rad = math.radians(random.uniform(-MAX_TURN_DEG, MAX_TURN_DEG))
+            cut = _that_stays_inside(cut, turn_rad)
+        zoom = longer_px / max(cut.width, cut.height)
         size = (round(cut.width * zoom), round(cut.height * zoom))
-        # Pixel centres of the print in those of the photograph
-        to_photograph = np.array(
+        turn = np.array(
             [
-                [1.0 / zoom, 0.0, cut.left + 0.5 / zoom - 0.5],
-                [0.0, 1.0 / zoom, cut.top + 0.5 / zoom - 0.5],
+                [math.cos(turn_rad), -math.sin(turn_rad)],
+                [math.sin(turn_rad), math.cos(turn_rad)],
             ]
         )
-        flags = cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_CUBIC
+        middle = np.array([cut.left + cut.width / 2.0, cut.top + cut.height / 2.0])
+        print_middle = np.array([cut.width, cut.height]) * zoom / 2.0
+        # Pixel centres of the print in those of the photograph
+        offset = middle - 0.5 - turn @ (print_middle - 0.5) / zoom
+        to_photograph = np.column_stack([turn / zoom, offset])
+        flags = cv2.INTER_CUBIC
         blurred = photograph
         if zoom < 1.0:
             sigma = 0.5 * math.sqrt(1.0 / zoom**2 - 1.0)
@@ -126,20 +152,19 @@ def make_prints(
             [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY],
         )
         focal_px = camera.mean_focal_length() * scale * zoom
+        axis_px = print_middle + turn.T @ (np.array(center) - middle) * zoom
         own = pycolmap.Camera(
             model="SIMPLE_PINHOLE",
             width=size[0],
             height=size[1],
-            params=[
-                focal_px,
-                (center[0] - cut.left) * zoom,
-                (center[1] - cut.top) * zoom,
-            ],
+            params=[focal_px, *axis_px],
             camera_id=number + 1,
         )
         made.add_camera_with_trivial_rig(own)
         copy = pycolmap.Image(name=name, camera_id=own.camera_id, image_id=number + 1)
-        made.add_image_with_trivial_frame(copy, image.cam_from_world())
+        back = pycolmap.Rotation3d(np.array([0.0, 0.0, -turn_rad]))
+        turned = pycolmap.Rigid3d(back, np.zeros(3)) * image.cam_from_world()
+        made.add_image_with_trivial_frame(copy, turned)
     made.write_text(str(output_path / "ground_truth"))
 
 
@@ -151,7 +176,7 @@ def main() -> None:
     parser.add_argument("image_path", type=Path, help="folder of the photographs")
     parser.add_argument("truth_path", type=Path, help="folder of their COLMAP model")
     parser.add_argument("output_path", type=Path, help="folder that is written")
-    parser.add_argument("--kind", choices=("crop", "shift", "whole"), default="crop")
+    parser.add_argument("--kind", choices=KINDS, default="crop")
     parser.add_argument("--step", type=int, default=1, help="every n-th photograph")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from prints import make_prints
+from prints import KINDS, make_prints
 from synthetic import blobs, centroid
 
 from colmap_affrect.colmap import pycolmap
@@ -84,15 +85,15 @@ def test_whole_runs_that_cannot_end_well_do_not_begin(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["crop", "shift", "whole"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_print_has_the_camera_that_is_written_beside_it(
     tmp_path: Path, kind: str
 ) -> None:
-    """A blob on the optical axis is at the principal point of the print."""
+    """A blob beside the optical axis is where the print's camera projects it to."""
     image_path = tmp_path / "photos"
     image_path.mkdir()
-    axis_px = np.array([[320.0, 236.0]])  # from the centre of the first pixel
-    photograph = blobs((640, 480), axis_px, 6.0 * np.eye(2))
+    blob_px = np.array([[345.0, 225.0]])  # from the centre of the first pixel
+    photograph = blobs((640, 480), blob_px, 6.0 * np.eye(2))
     cv2.imwrite(str(image_path / "a.png"), photograph)
     truth = pycolmap.Reconstruction()
     params = [700.0, 320.5, 236.5]  # from its corner
@@ -106,15 +107,21 @@ def test_a_print_has_the_camera_that_is_written_beside_it(
     truth.write_text(str(tmp_path / "truth"))
     out = tmp_path / "out"
     make_prints(image_path, tmp_path / "truth", out, kind, step=1, seed=3)
-    (made,) = pycolmap.Reconstruction(str(out / "ground_truth")).cameras.values()
+    model = pycolmap.Reconstruction(str(out / "ground_truth"))
+    (made,) = model.cameras.values()
+    (print_image,) = model.images.values()
     seen = cv2.imread(str(out / "images" / "a.jpg"), cv2.IMREAD_GRAYSCALE)
     assert seen.shape == (made.height, made.width)
-    center = np.array([made.principal_point_x, made.principal_point_y])
+    in_world = np.append((blob_px[0] + 0.5 - params[1:]) / params[0], 1.0)
+    in_camera = print_image.cam_from_world() * in_world
     found = centroid(seen, float(np.median(seen)))
-    assert found + 0.5 == pytest.approx(center, abs=0.15)
+    assert found + 0.5 == pytest.approx(made.img_from_cam(in_camera), abs=0.15)
+    center = np.array([made.principal_point_x, made.principal_point_y])
     zoom = made.mean_focal_length() / 700.0
     offset = center - np.array([made.width, made.height]) / 2.0
     assert zoom > 1.5
+    turn_deg = math.degrees(print_image.cam_from_world().rotation.angle())
+    assert (turn_deg > 1.0) == (kind == "turned")
     if kind == "whole":
         assert np.abs(offset).max() < 0.02 * made.width
     else:

@@ -121,6 +121,17 @@ def test_cost_of_an_adjustment_and_of_a_score_have_the_same_prior() -> None:
             )
 
 
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_two_focal_lengths_of_a_camera_cost_as_much_as_one(model: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, model, TRUE_FOCAL, *SIZE)
+    prior = CameraPrior(0.7 * TRUE_FOCAL, 0.3)
+    cost = IntrinsicsCost(camera, prior, 0.5, constant=[])
+    residuals = np.zeros(len(camera.params))
+    assert cost.Evaluate([camera.params], residuals, None)
+    nats = 0.5 * (residuals @ residuals) / 0.5**2
+    assert nats == pytest.approx(prior.cost_of(camera))
+
+
 def test_a_distortion_of_a_seventh_costs_as_much_as_two_deviations() -> None:
     distorted = pycolmap.Camera.create_from_model_name(
         1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE

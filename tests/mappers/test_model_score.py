@@ -86,6 +86,8 @@ def test_long_tracks_are_points_that_images_from_three_viewpoints_see() -> None:
     seen = {1: np.array([5, 6, -1, 7]), 2: np.array([6, 5, 7]), 3: np.array([-1, 5, 7])}
     assert _seen_by_three(seen, {}).tolist() == [5, 7]
     assert _seen_by_three(seen, {1: 1, 3: 1}).tolist() == []
+    twice_in_one = {1: np.array([5, 5]), 2: np.array([5])}
+    assert _seen_by_three(twice_in_one, {}).tolist() == []
 
 
 def test_improbable_cameras_lower_the_score(tmp_path: Path) -> None:

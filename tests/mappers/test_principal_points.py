@@ -27,6 +27,7 @@ from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.principal_points import (
     contradict_constant,
+    freed_principal_point_cost,
     with_free_principal_points,
 )
 from colmap_affrect.mappers.search import Search
@@ -98,6 +99,21 @@ def relative_rotation(
 
 def center_of(camera: pycolmap.Camera) -> Array:
     return np.array([camera.principal_point_x, camera.principal_point_y])
+
+
+def searches_of(
+    path: Path, records: Mapping[int, CameraRecord]
+) -> tuple[Search, Search]:
+    """Return a search with constant principal points, and the same with free ones."""
+    task = MappingTask(path, None, cameras=records)
+    graph = PairGraph.read(path)
+    native = mapper_of("sparse").native(task, 0)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
+    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    free = with_free_principal_points(constant, task.cameras)
+    assert free is not None
+    return constant, free
 
 
 def records_of(
@@ -187,6 +203,25 @@ def test_an_axis_that_mapping_moved_has_the_prior_of_a_print() -> None:
     assert camera_prior(camera, WHOLE).principal_point is None
 
 
+def test_only_principal_points_that_were_freed_are_paid_for(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
+    constant, free = searches_of(path, records_of(truth, UNKNOWN))
+    first, second, third = sorted(truth.cameras)
+    crop = shifted_principal_point(truth.cameras[first])
+    priors = dict(constant.adjuster.priors)
+    priors[first] = replace(priors[first], principal_point=crop)
+    adjuster = replace(constant.adjuster, priors=priors)
+    knows_a_crop = replace(constant, adjuster=adjuster)
+    sigma_px = 0.15 * 1024
+    truth.cameras[first].principal_point_x += 2.0 * sigma_px
+    assert freed_principal_point_cost(truth, knows_a_crop, free) == 0.0
+    truth.cameras[second].principal_point_x += 2.0 * sigma_px
+    truth.cameras[third].principal_point_y -= sigma_px
+    paid = freed_principal_point_cost(truth, knows_a_crop, free)
+    assert paid == pytest.approx(2.0 + 0.5)
+
+
 @pytest.mark.parametrize(
     ("crop_share", "shift_share", "contradict"),
     [
@@ -207,14 +242,7 @@ def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
     """Shares are those of half the logarithm of the number of observations, per camera."""
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
-    task = MappingTask(path, None, cameras=records_of(truth, UNKNOWN))
-    graph = PairGraph.read(path)
-    native = mapper_of("sparse").native(task, 0)
-    priors = camera_priors(graph.cameras.values(), task.cameras, {})
-    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
-    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
-    free = with_free_principal_points(constant, task.cameras)
-    assert free is not None
+    constant, free = searches_of(path, records_of(truth, UNKNOWN))
     unit = 3 * 0.5 * math.log(truth.compute_num_observations())
 
     def costs(search: Search, _: pycolmap.Reconstruction) -> tuple[float, float]:

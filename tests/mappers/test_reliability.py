@@ -165,6 +165,13 @@ def test_terms_are_those_that_the_weights_were_fitted_to(
     assert TERMS[term].value(features) == pytest.approx(expected, abs=0.01)
 
 
+def test_any_number_of_tie_points_has_a_probability() -> None:
+    contradicted = confidence(replace(GOOD, tie_point_log_odds=-5000.0))
+    confirmed = confidence(replace(GOOD, tie_point_log_odds=5000.0))
+    assert contradicted.probability == 0.0
+    assert confirmed.probability > confidence(GOOD).probability
+
+
 def test_two_reasons_are_said_and_no_small_ones() -> None:
     doubted = replace(
         GOOD, log_likelihood_ratio=-20.0, agreement=0.2, mirrored_original="c.jpg"

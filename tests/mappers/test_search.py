@@ -556,3 +556,23 @@ def test_photographs_get_own_cameras_and_models_of_other_places_stay(
     assert [model.reconstruction.num_reg_images() for model in again] == [4, 2]
     focals_px = focals_of(again[0])
     assert focals_px == pytest.approx(found, rel=0.01)
+
+
+def test_known_models_stay_as_they_are_when_they_are_extended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=6, num_points3D=150, noise_px=NOISE_PX)
+    ids = sorted(truth.reg_image_ids())
+    known = []
+    for lost in (ids[3:], ids[:3]):
+        model = pycolmap.Reconstruction(truth)
+        for image_id in lost:
+            model.deregister_frame(model.images[image_id].frame_id)
+        known.append(MappedModel(model))
+    before_px = [focals(mapped.reconstruction) for mapped in known]
+    search = unknown_search((path, truth), Search)
+    monkeypatch.setattr(Search, "with_bridges", lambda _, __, models: list(models))
+    found = search.extend_models(search.graph, known)
+    assert len(found) >= 2
+    assert [focals(mapped.reconstruction) for mapped in known] == before_px
