@@ -10,12 +10,14 @@ from strategies import Array
 from colmap_affrect.data import LocalFeatures, Rectification
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.lines import Explanation
+from colmap_affrect.rectifiers.affine_warps import DenseShapesOptions
 from colmap_affrect.rectifiers.execute import (
     _keep_strongest,
     _warped_mask,
     is_in_warp,
 )
 from colmap_affrect.rectifiers.line_planes import camera_matrix_of
+from colmap_affrect.rectifiers.regions import Region
 
 
 def features_at(points: Array, radii_px: Array, responses: Array) -> LocalFeatures:
@@ -87,3 +89,15 @@ def test_a_camera_by_lines_has_its_axis_as_far_below_the_middle_as_lines_say() -
     explanation = Explanation(1.5, 0.1, np.eye(3), np.zeros(0, np.int64), 9.0)
     expected = [[300.0, 0.0, 99.5], [0.0, 300.0, 49.5 + 20.0], [0.0, 0.0, 1.0]]
     assert_allclose(camera_matrix_of(explanation, (200, 100)), expected)
+
+
+@pytest.mark.parametrize(("area_preserving", "area"), [(True, 1.0), (False, 0.25)])
+def test_warps_keep_the_area_or_magnify_nothing_as_it_is_asked_for(
+    area_preserving: bool, area: float
+) -> None:
+    region = Region(np.ones((30, 40), bool), (5, 7))
+    options = DenseShapesOptions(area_preserving=area_preserving)
+    item = options.warp(region, 4.0, 0.3, 2)
+    linear = item.rectified_from_image[:2, :2]
+    assert np.linalg.det(linear) == pytest.approx(area)
+    assert np.linalg.svd(linear)[1] == pytest.approx([2.0 * area**0.5, 0.5 * area**0.5])
