@@ -13,9 +13,11 @@ import pytest
 from colmap_affrect.escalation import alternatives, escalate
 from colmap_affrect.escalation.alternatives import (
     SCORE,
+    Choice,
     _choice_of_learned_matches,
     _set_of,
     keep_best,
+    map_learned_matches,
     needs_learned_models,
     num_right_poses_of_best,
     restore_best,
@@ -70,6 +72,35 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
     assert needs_learned_models(context) == is_needed
     context.workspace.learned.mkdir()
     assert not needs_learned_models(context)
+
+
+@pytest.mark.parametrize(
+    ("sure", "is_sure"), [(["a", "b", "c"], True), (["a", "b"], False), ([], False)]
+)
+def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
+    sure: list[str], *, is_sure: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path)
+    context.by_hand.left_out = ()
+    recorded = list[LearnedModels]()
+
+    def update_state(learned_models: LearnedModels) -> None:
+        recorded.append(learned_models)
+
+    context.matches.update_state = update_state
+    model = SimpleNamespace(sure=sure, probabilities=dict.fromkeys(NAMES, 0.9))
+    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [model])
+    monkeypatch.setattr(
+        alternatives, "_choice_of_learned_matches", lambda _: Choice((), {})
+    )
+    let_models_have(1.2, monkeypatch)
+    escalation: Any = SimpleNamespace(context=context)
+    mapper: Any = None
+    map_learned_matches(escalation, mapper)
+    (found,) = recorded
+    assert found.is_sure == is_sure
+    assert found.score == pytest.approx(3 * 0.9 - 1.0)
+    assert found.score_without == 1.2
 
 
 def test_the_best_models_are_kept_with_their_matches(

@@ -110,6 +110,35 @@ def test_images_lack_levels_and_those_of_another_recipe_do_not_count() -> None:
     assert state._lacking_by_level(["a", "b"]) == [set(), {"b"}, {"a", "b"}]
 
 
+def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
+    state = state_of(["a", "b"], ())
+    context: Any = state.context
+    context.resources = SimpleNamespace(usable_levels=lambda _: [0, 1, 3])
+    context.features.image_sizes = dict
+    context.usable = lambda _: []
+    context.num_verified_inliers = dict
+    context.matches = SimpleNamespace(
+        levels=lambda *_: {},
+        measured_worths=lambda _: {},
+        learned_levels=lambda _: {},
+    )
+    found = state.situation({}, one_model())
+    assert list(found.usable) == [1, 3]
+    assert found.registered == ("a",)
+
+
+def one_model() -> list[ModelSummary]:
+    """Return one model of one image."""
+    return [
+        ModelSummary(
+            registered_names=("a",),
+            num_points3D=90,
+            mean_track_length=3.0,
+            mean_reprojection_error_px=0.5,
+        )
+    ]
+
+
 def test_two_images_are_never_weakly_connected() -> None:
     for names, weak in ((["a", "b"], set[str]()), (["a", "b", "c"], {"a", "b"})):
         state = state_of(names, ())
