@@ -85,6 +85,14 @@ def test_a_warp_is_masked_outside_of_its_region_and_where_the_photograph_is() ->
         assert inside[y, x] == expected
 
 
+def test_a_warp_of_a_whole_photograph_is_masked_where_that_is() -> None:
+    whole = Rectification(np.eye(3), (100, 60), None, 1.0, 0.0)
+    mask = np.ones((60, 100), bool)
+    mask[:, 80:] = False
+    inside = _warped_mask(whole, mask, (60, 100)) > 0
+    assert inside.tolist() == mask.tolist()
+
+
 def test_a_camera_by_lines_has_its_axis_as_far_below_the_middle_as_lines_say() -> None:
     explanation = Explanation(1.5, 0.1, np.eye(3), np.zeros(0, np.int64), 9.0)
     expected = [[300.0, 0.0, 99.5], [0.0, 300.0, 49.5 + 20.0], [0.0, 0.0, 1.0]]
