@@ -17,9 +17,8 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
-MAX_ITERATIONS = (
-    20  # each point is a problem of its own, for which few suffice; resource
-)
+# Each point is a problem of its own, for which few suffice; resource
+MAX_ITERATIONS = 20
 
 
 def complete_points(
