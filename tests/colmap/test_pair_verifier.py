@@ -10,6 +10,7 @@ from colmap_affrect.colmap.verification import (
     PairVerifier,
     Side,
     VerificationOptions,
+    _each_once,
     estimate_geometry,
 )
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
@@ -79,3 +80,9 @@ def test_where_print_made_the_geometry_all_other_matches_are_tried() -> None:
     inliers = np.asarray(geometry.inlier_matches, np.int64)[:, 0]
     assert set(range(NUM)) <= set(inliers.tolist())
     assert len(inliers) <= NUM + 4
+
+
+def test_repeated_matches_are_evidence_once_in_their_order() -> None:
+    matches = np.array([[7, 1], [2, 3], [7, 1], [2, 5], [2, 3]])
+    assert _each_once(matches).tolist() == [[7, 1], [2, 3], [2, 5]]
+    assert _each_once(matches[:2]).tolist() == [[7, 1], [2, 3]]
