@@ -11,8 +11,8 @@ repeated.
 
 With `--changes` other changes are tried in their place, those of a file: a JSON list of objects
 with `module`, `before` and `after`, a text that the module has once, and what it becomes. Those of
-`tests/benchmarks/changes.json` have been tried, and all fail some test but for those in its last
-lines, which change nothing that can be told; what the code does not have any more is passed over.
+`tests/benchmarks/changes.json` were tried in November 2026: each fails some test. What the code
+does not have any more is passed over.
 """
 
 from __future__ import annotations
