@@ -10,7 +10,7 @@ leaves them off by 4 to 8 (``tests/benchmarks/prints.py``).
 import math
 from collections import Counter
 from collections.abc import Mapping, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,17 +63,51 @@ def with_free_principal_points(
     return _with_priors(search, priors)
 
 
-def contradict_constant(
-    model: pycolmap.Reconstruction, constant: Search, free: Search
-) -> bool:
-    """Tell whether the points of a model say that constant principal points are wrong.
+@dataclass(frozen=True)
+class FreedomGains:
+    """How much lower the cost of a model is with free principal points, in nats.
 
-    The cost with free ones must be lower by more than free parameters are worth (BIC: Schwarz,
-    Estimating the dimension of a model, 1978), half the logarithm of the number of observations
-    each. These are one of each view camera, which shifts up and down, or two of each crop. Of
-    made-up prints the cost is lower by 34 to 680, just as much as is needed or up to 16 times that,
-    of whole photographs by 2 to 17, at most half of it. A lens that distortion has trapped is no
-    sign: all also begin with a straight one.
+    View cameras shift up and down, which is one parameter each, crops have two.
+    """
+
+    by_shifts: float
+    by_crops: float
+    num_freed: int  # principal points
+    num_observations: int
+
+    @property
+    def contradict_constant(self) -> bool:
+        """Whether the points say that constant principal points are wrong.
+
+        The gain is more than free parameters are worth (BIC: Schwarz, Estimating the dimension of a
+        model, 1978), half the logarithm of the number of observations each. Of made-up prints the
+        cost is lower by 34 to 680, just as much as is needed or up to 16 times that, of whole
+        photographs by 2 to 17, at most half of it.
+        """
+        return self._exceed(0.5 * math.log(max(self.num_observations, 1)))
+
+    @property
+    def leave_constant_open(self) -> bool:
+        """Whether the points do not say that constant principal points are right.
+
+        Free ones predict better (AIC: Akaike, A new look at the statistical model identification,
+        1974): the gain is more than one nat a parameter. Of whole photographs of facades it is
+        less; of statues and toys, which hold cameras loosely, crops and whole ones have more.
+        """
+        return self._exceed(1.0)
+
+    def _exceed(self, per_parameter: float) -> bool:
+        """Tell whether one of the gains is more than its parameters cost."""
+        per_shift = per_parameter * self.num_freed
+        return self.by_shifts > per_shift or self.by_crops > 2.0 * per_shift
+
+
+def gains_of_freedom(
+    model: pycolmap.Reconstruction, constant: Search, free: Search
+) -> FreedomGains:
+    """Return how much the cost of a model falls with free principal points.
+
+    A lens that distortion has trapped is no sign: all adjustments also begin with a straight one.
 
     Args:
         model: With constant principal points; it stays as it is.
@@ -81,17 +115,18 @@ def contradict_constant(
         free: The search with free principal points.
     """
     num_observations = with_fewer_points(model).compute_num_observations()
-    if not num_observations:
-        return False
     freed = _freed(model, constant, free).keys()
-    per_parameter = 0.5 * math.log(num_observations)
+    if not num_observations or not freed:
+        return FreedomGains(0.0, 0.0, 0, 0)
     constant_cost = min(constant.costs_of_starts(model))
     crop_cost = min(free.costs_of_starts(model))
-    if constant_cost - crop_cost > 2 * len(freed) * per_parameter:
-        return True
-    shifted = _only_up_and_down(free, freed)
-    shift_cost = min(shifted.costs_of_starts(model))
-    return constant_cost - shift_cost > len(freed) * per_parameter
+    shift_cost = min(_only_up_and_down(free, freed).costs_of_starts(model))
+    return FreedomGains(
+        by_shifts=constant_cost - shift_cost,
+        by_crops=constant_cost - crop_cost,
+        num_freed=len(freed),
+        num_observations=num_observations,
+    )
 
 
 def _only_up_and_down(free: Search, freed: Set[int]) -> Search:

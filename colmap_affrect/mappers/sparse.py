@@ -22,8 +22,8 @@ from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
-    contradict_constant,
     freed_principal_point_cost,
+    gains_of_freedom,
     with_free_principal_points,
     with_shifted_axes,
 )
@@ -409,14 +409,32 @@ class _HypothesisTest:
         self.score = self.search.best_score(self.best)
 
     def _try_shifted_axes(self) -> None:
-        """Free the principal points of the best model where its points ask for it."""
+        """Free the principal points of the best model where its points ask for it.
+
+        Where the points leave that open, how far rotations turn with free ones says how sure they
+        are.
+        """
         search = self.search
         if not self.best or search.graph.has_rigs:
             return
         free = with_free_principal_points(search, self.task.cameras)
         model = self.best[0].reconstruction
-        if free is None or not contradict_constant(model, search, free):
+        if free is None:
             return
+        gains = gains_of_freedom(model, search, free)
+        if gains.contradict_constant and self._take_shifted_axes(free):
+            return
+        if gains.leave_constant_open:
+            turns_deg = axis_turns_deg(model, free, search.graph)
+            self.best = [
+                replace(self.best[0], axis_turns_deg=turns_deg),
+                *self.best[1:],
+            ]
+
+    def _take_shifted_axes(self, free: Search) -> bool:
+        """Take the best model with free principal points where it scores higher; tell whether."""
+        search = self.search
+        model = self.best[0].reconstruction
         changed = with_shifted_axes(model, free, search.graph)
         share = self._motion_share(self.best[0])
         changed_model = _also_by(
@@ -431,9 +449,8 @@ class _HypothesisTest:
         if score + paid > self.score + MIN_SCORE_GAIN:
             self.search = free
             self._take(found, score)
-            return
-        turns_deg = axis_turns_deg(model, free, search.graph)
-        self.best = [replace(self.best[0], axis_turns_deg=turns_deg), *self.best[1:]]
+            return True
+        return False
 
     def _try_per_image_cameras(self, hypothesis: _Hypothesis) -> None:
         """Give each image of the best model a camera of its own where that scores higher."""
