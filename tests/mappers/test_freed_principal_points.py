@@ -1,4 +1,4 @@
-"""When the cost says that principal points are not in the middle, and how far rotations change."""
+"""Where view cameras have their axes, and how far rotations change with free ones."""
 
 from __future__ import annotations
 
@@ -17,44 +17,8 @@ from colmap_affrect.mappers.camera_priors import (
 )
 from colmap_affrect.mappers.principal_points import (
     _only_up_and_down,
-    contradict_constant,
     median_turns_deg,
 )
-
-NUM_OBSERVATIONS = 1000  # half of whose logarithm is 3.45
-
-
-def search_of(cost: float) -> Any:
-    """Return a search whose models have a cost, as they are and from a straight lens."""
-    return SimpleNamespace(costs_of_starts=lambda _: (cost + 50.0, cost))
-
-
-@pytest.mark.parametrize(
-    ("gain_of_crops", "gain_of_shifts", "is_contradicted"),
-    [
-        (15.0, 0.0, True),  # two of each of two cameras are worth 13.8
-        (12.0, 5.0, False),
-        (12.0, 8.0, True),  # one of each is worth 6.9
-        (5.0, 5.0, False),
-    ],
-)
-def test_free_principal_points_must_be_worth_two_parameters_or_one_that_shifts(
-    gain_of_crops: float,
-    gain_of_shifts: float,
-    *,
-    is_contradicted: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    fewer = SimpleNamespace(compute_num_observations=lambda: NUM_OBSERVATIONS)
-    monkeypatch.setattr(principal_points, "with_fewer_points", lambda _: fewer)
-    monkeypatch.setattr(principal_points, "_freed", lambda *_: {1: None, 2: None})
-    shifted = search_of(100.0 - gain_of_shifts)
-    monkeypatch.setattr(principal_points, "_only_up_and_down", lambda *_: shifted)
-    nothing: Any = None
-    found = contradict_constant(
-        nothing, search_of(100.0), search_of(100.0 - gain_of_crops)
-    )
-    assert found == is_contradicted
 
 
 def test_view_cameras_shift_up_and_down_as_prints_and_are_in_the_middle_across(
