@@ -29,9 +29,8 @@ class Photograph:
     gray: GrayImage  # (H, W) uint8 at the size of processing, at most ``max_image_size_px``
     name: str  # relative POSIX path below the image folder, the key of depth maps
     path: Path | None  # the file; None for an image that was never one
-    camera_matrix: (
-        Array  # (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``
-    )
+    # (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``
+    camera_matrix: Array
     mask: Mask | None = None  # (H, W) bool, where features may be; None: everywhere
     color: ColorImage | None = None  # (H, W, 3) uint8, for extractors that ask for it
     stretched: bool = False  # its contrast was low, and its tones have been stretched
@@ -55,9 +54,8 @@ class ShapeGrid:
     """Affine shapes on a regular grid over an image; what every dense shape source returns."""
 
     metrics: Floats  # (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
-    textured: (
-        Mask  # (R, C) bool, False where the image has no structure to read a shape from
-    )
+    # (R, C) bool, False where the image has no structure to read a shape from
+    textured: Mask
     origin_px: float  # centre of cell (0, 0) in x and in y, pixel-centre px
     step_px: int  # distance of neighbouring cells in px
 

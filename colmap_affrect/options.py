@@ -286,9 +286,8 @@ class Registry(Generic[Part]):
         Raises OptionError for an unknown name, and for a part that another package provides and
         that does not load, or lacks what parts of this kind must have. It names that package.
         """
-        if (
-            name in self.built_in
-        ):  # do not ask for the entry points of all installed packages
+        # Looking for entry points of all installed packages takes long
+        if name in self.built_in:
             return metadata.EntryPoint(name, self.built_in[name], self.group).load()
         points = self._points(name)
         where = self._named(points)
@@ -300,10 +299,8 @@ class Registry(Generic[Part]):
             )
         try:
             part = points[0].load()
-        except (
-            Exception,
-            SystemExit,
-        ) as error:  # of any kind: it is the code of others
+        except (Exception, SystemExit) as error:
+            # Code of others may raise anything
             if lacks_memory(error):
                 raise
             why = f"cannot be loaded ({type(error).__name__}: {reason(error)})"

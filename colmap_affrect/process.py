@@ -3,13 +3,18 @@
 On Linux the command runs in a child process. The parent passes Ctrl-C and SIGTERM on. It kills the
 child at once while that still loads packages, which would answer a signal with errors of their own,
 or lose it; later where the child does not end within four seconds, as in native code that never
-returns. When native code has crashed it says so in one line. Nothing heavy is imported here.
+returns. When native code has crashed it says so in one line. While the child loads packages, which
+lets no thread of its own speak, it says that it is at work. Nothing heavy is imported here.
 """
 
+import atexit
 import gc
 import os
+import select
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
@@ -28,6 +33,12 @@ from colmap_affrect.parallel.subprocesses import end_with
 
 # That a command has to end after Ctrl-C or SIGTERM, before it is killed; resource
 PATIENCE_S = 4.0
+# Until something says that packages are loaded, and on a terminal between two such lines: with the
+# start of Python less than 5; display
+QUIET_S = 3.0
+TICK_S = 0.5  # between two looks at the clock; display
+LOADING = "loading: at work for {seconds:.0f} s"
+LOADED = "loading: done in {seconds:.0f} s"
 WITHOUT_MEMORY = " (perhaps for want of memory)"
 KEPT = (
     "run.log may say why, and what was done before is kept: run the same command again, or "
@@ -41,12 +52,13 @@ ENDED = b"e"
 
 def run_command() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
+    began_s = time.monotonic()
     _open_standard_streams()
     # Results would be lost with a mask that takes rights from the owner.
     os.umask(os.umask(0) & 0o077)
     if sys.platform != "linux":
         # Elsewhere libraries of the system do not survive a fork.
-        _work()
+        _work(began_s)
     parent = os.getpid()
     # Else nobody could wait for the worker.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -55,10 +67,11 @@ def run_command() -> NoReturn:
     try:
         worker = os.fork()
     except OSError:  # too many processes
-        _work()
+        _work(began_s)
     if not worker:
         end_with(parent)
-        _work_and_tell(messages)
+        _work_and_tell(began_s, messages)
+    _speak_meanwhile(began_s, messages.wait)
     sys.exit(_wait_for(worker, messages))
 
 
@@ -107,6 +120,49 @@ class _Messages:
             self._received += os.read(self._out, 2)
         return self._received
 
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until anything has been told, and return whether it has; nothing is read."""
+        if self._received:
+            return True
+        return bool(select.select([self._out], [], [], timeout_s)[0])
+
+
+def _speak_meanwhile(began_s: float, wait: Callable[[float], bool]) -> None:
+    """Say in the background that packages are loaded, once that takes long.
+
+    Args:
+        began_s: when the process began, of the monotonic clock.
+        wait: waits for some seconds, and returns whether they are loaded.
+    """
+    if _is_quiet():
+        return
+
+    def speak() -> None:
+        if hasattr(signal, "pthread_sigmask"):  # signals are for the main thread
+            signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        is_watched = bool(sys.stderr) and sys.stderr.isatty()
+        wanted_s = QUIET_S
+        while not wait(TICK_S):
+            passed_s = time.monotonic() - began_s
+            if passed_s >= wanted_s:
+                say(LOADING.format(seconds=passed_s))
+                # In a log each line comes after twice the time
+                wanted_s = passed_s + QUIET_S if is_watched else 2 * passed_s
+
+    threading.Thread(target=speak, daemon=True).start()
+
+
+def _end_speaking(began_s: float) -> None:
+    """Say that packages are loaded, where that has taken long: the command speaks after seconds."""
+    passed_s = time.monotonic() - began_s
+    if passed_s >= QUIET_S and not _is_quiet():
+        say(LOADED.format(seconds=passed_s))
+
+
+def _is_quiet() -> bool:
+    """Return whether the command is to say nothing but its result."""
+    return not {"-q", "--quiet"}.isdisjoint(sys.argv)
+
 
 def _open_standard_streams() -> None:
     """Give the process those of the first three files that it was started without.
@@ -148,12 +204,32 @@ def _exit_code(code: int, signals: list[int]) -> int:
     return 1
 
 
-def _work_and_tell(messages: _Messages) -> NoReturn:
-    """Run the command line, and tell when it ends, as native code that ends it does not."""
+def _work_and_tell(began_s: float, messages: _Messages) -> NoReturn:
+    """Run the command line, and tell when it ends, as native code that ends it does not.
+
+    Args:
+        began_s: when the process began, of the monotonic clock.
+        messages: to the parent.
+    """
     try:
-        _work(lambda: messages.write(BEGUN))
+        _work(began_s, lambda: messages.write(BEGUN))
+    except SystemExit as end:
+        if isinstance(end.code, int):
+            messages.write(ENDED)
+            _end_at_once(end.code)
+        raise
     finally:
         messages.write(ENDED)
+
+
+def _end_at_once(code: int) -> NoReturn:
+    """End without taking apart what is loaded: with torch that is most of a second of silence."""
+    with suppress(OSError, ValueError):
+        for stream in (sys.stdout, sys.stderr):
+            if stream:
+                stream.flush()
+    atexit._run_exitfuncs()
+    os._exit(code)
 
 
 def _leave(*_: object) -> NoReturn:
@@ -188,22 +264,29 @@ class _Interrupts:
         raise KeyboardInterrupt
 
 
-def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
+def _work(began_s: float, tell_begin: Callable[[], None] | None = None) -> NoReturn:
     """Run the command in this process.
 
     The first Ctrl-C or SIGTERM is raised as an exception, so that the command can tidy up; another
     Ctrl-C ends it at once. Both are put off while packages are loaded, where a parent is told when
     that has come to an end; else they end the process at once.
+
+    Args:
+        began_s: when the process began, of the monotonic clock.
+        tell_begin: tells a parent that all is loaded; None where there is no parent.
     """
     interrupts = _Interrupts()
+    is_loaded = threading.Event()
     code: int | str | None
 
     def begin() -> None:
         # What has been loaded stays: nothing of it is to be looked for garbage.
         gc.freeze()
         gc.enable()
+        is_loaded.set()
         if tell_begin:
             tell_begin()
+        _end_speaking(began_s)
         _handle(interrupts.raise_first)
 
     for stream in (sys.stdout, sys.stderr):
@@ -211,6 +294,7 @@ def _work(tell_begin: Callable[[], None] | None = None) -> NoReturn:
     try:
         if not tell_begin:
             _handle(_leave)
+            _speak_meanwhile(began_s, is_loaded.wait)
         gc.disable()  # while packages are loaded, which is a tenth faster so
         from colmap_affrect.cli import main
 

@@ -329,11 +329,8 @@ def _read_recipe(name: str) -> dict[str, Any]:
         return tomllib.loads(read_regular_text(path, "utf-8-sig"))
     except FileNotFoundError as error:
         raise OptionError("no such file", where=f"recipe {name}") from error
-    except (
-        OSError,
-        ValueError,
-        RecursionError,
-    ) as error:  # what tomllib raises on odd files
+    except (OSError, ValueError, RecursionError) as error:
+        # tomllib raises these on odd files
         raise OptionError(
             f"cannot be read ({error})", where=f"recipe {path}"
         ) from error

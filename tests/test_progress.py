@@ -9,15 +9,19 @@ from collections.abc import Callable
 
 import pytest
 
-from colmap_affrect.progress import (
-    _AT_WORK,
+from colmap_affrect.forecast import (
     AFTER_SHARE,
+    CORE_S_PER_MEGAPIXEL,
     COSTS,
     GOES_ON_SHARE,
     LEARNED_COSTS,
+    MIN_ELAPSED_S,
+    Forecast,
+)
+from colmap_affrect.progress import (
+    _AT_WORK,
     NUM_PLAIN_LINES,
     SILENT,
-    Forecast,
     Progress,
     Voice,
     show,
@@ -143,6 +147,25 @@ def test_mapping_is_not_at_its_end_with_the_last_photograph() -> None:
     assert after_s is not None
     assert before_s > 5.0
     assert after_s > GOES_ON_SHARE * 60.0
+
+
+def test_a_run_is_forecast_by_its_megapixels_before_a_photograph_is_done() -> None:
+    """Ten photographs of two megapixels take ten seconds on three cores, at first."""
+    clock = Clock()
+    forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0, num_cores=3)
+    clock.now_s += MIN_ELAPSED_S
+    assert forecast.left_s() is None
+    forecast.begin("extract", 10)
+    units = 10 + 45 * (COSTS["match"] + COSTS["verify"]) + 12 * COSTS["map"]
+    assert pytest.approx(1.5, rel=0.3) == CORE_S_PER_MEGAPIXEL
+    assert forecast.left_s() == pytest.approx(1.0 * units, rel=0.3)
+    clock.now_s += 6.0  # three cores work on the first three: two seconds each at least
+    unit_s = 6.0 / 3
+    assert forecast.left_s() == pytest.approx(unit_s * units - 6.0, rel=0.01)
+    clock.now_s += 6.0
+    forecast.advance(3)
+    forecast.advance(6)
+    assert forecast.left_s() is not None
 
 
 def test_forecasts_are_shown_with_the_stage_once_enough_is_measured() -> None:

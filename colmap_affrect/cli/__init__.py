@@ -54,8 +54,7 @@ def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
     )
     with _logging(options):
         options.progress = SILENT if options.quiet else Progress(sys.stderr)
-        with options.progress.never_silent():
-            from colmap_affrect.cli import commands  # not for --help; takes seconds
+        from colmap_affrect.cli import commands  # not for --help; takes seconds
 
         command = getattr(commands, options.command.replace("-", "_"), commands.stage)
         begin()

@@ -15,7 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import cameras_of_images
+from colmap_affrect.colmap.database import (
+    cameras_of_images,
+    ids_of_images,
+    names_of_images,
+)
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.masked_matches import leave_out_masked, read_painted_masks
 from colmap_affrect.errors import Option, OptionError, Row, Words
@@ -91,10 +95,8 @@ class ByHand(Options):
         """
         if first in self.left_out or second in self.left_out:
             return False
-        return (first, second) not in self.rejected and (
-            second,
-            first,
-        ) not in self.rejected
+        rejected = self.rejected
+        return (first, second) not in rejected and (second, first) not in rejected
 
     def texts(self) -> tuple[str, ...]:
         """Return what is said, in a few words each."""
@@ -151,9 +153,8 @@ class ByHand(Options):
         """Take out matches below masks; their pairs have to be verified again."""
         if not self.masks_path:
             return
-        images = database.read_all_images()
-        names = {image.name: image.image_id for image in images}
-        leave_out_masked(database, read_painted_masks(self.masks_path, names))
+        masks = read_painted_masks(self.masks_path, ids_of_images(database))
+        leave_out_masked(database, masks)
 
     def _add_tie_points(self, database: pycolmap.Database) -> Indices:
         """Add the tie points behind the keypoints of their images; return their numbers."""
@@ -179,7 +180,7 @@ class ByHand(Options):
 
     def _delete_pairs(self, database: pycolmap.Database) -> None:
         """Delete matches and two-view geometries of pairs that may not be used."""
-        names = {image.image_id: image.name for image in database.read_all_images()}
+        names = names_of_images(database)
         for ids in combinations(sorted(names), 2):
             if not self.allows(names[ids[0]], names[ids[1]]):
                 database.delete_two_view_geometry(*ids)

@@ -138,11 +138,11 @@ def check_database(
             _check_keypoints(connection, tables, found)
             _check_descriptors(connection, tables, found)
             _check_pairs(connection, tables, found)
-            if looks_for_moved and FATAL.isdisjoint(
-                found
-            ):  # else there may be no such rows
+            has_all_rows = FATAL.isdisjoint(found)
+            if looks_for_moved and has_all_rows:
                 moved = images_with_moved_keypoints(connection, tables)
-                found.update({"keypoints-moved": moved} if moved else {})
+                if moved:
+                    found["keypoints-moved"] = moved
         except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"damaged ({error})", where=path) from error
     return tables, dict(found)
@@ -158,12 +158,14 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         focals = like.focal_length_idxs()
         if not len(focals):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
-        params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if (
-            params is None
-            or not np.isfinite(params).all()
-            or (params[0, focals] <= 0.0).any()
-        ):
+        params = _array(
+            blob=camera.params,
+            rows=1,
+            columns=len(like.params),
+            dtype=np.dtype("<f8"),
+        )
+        is_finite = params is not None and np.isfinite(params).all()
+        if params is None or not is_finite or (params[0, focals] <= 0.0).any():
             found["bad-camera"].append(label)
         shorter = min(camera.width, camera.height)
         longer = max(camera.width, camera.height)
@@ -217,7 +219,15 @@ def _check_sizes(connection: sqlite3.Connection, table: str, found: Problems) ->
     sizes = MATRICES[table]
     for name in sizes.keys() & columns_of(connection, table):
         for row, blob in rows_of(connection, f"rowid {name}", table):
-            if blob and _array(blob, 1, sizes[name], np.dtype("<f8")) is None:
+            if not blob:
+                continue
+            matrix = _array(
+                blob=blob,
+                rows=1,
+                columns=sizes[name],
+                dtype=np.dtype("<f8"),
+            )
+            if matrix is None:
                 found["matrix-data"].append(f"{name} of row {row} of {table}")
 
 
@@ -245,7 +255,12 @@ def _check_keypoints(
         if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-data"].append(f"{name} has {width}")
             continue
-        keypoints = _array(blob, count, width, np.dtype("<f4"))
+        keypoints = _array(
+            blob=blob,
+            rows=count,
+            columns=width,
+            dtype=np.dtype("<f4"),
+        )
         if keypoints is None:
             found["keypoint-data"].append(name)
             continue
@@ -270,7 +285,13 @@ def _check_descriptors(
 ) -> None:
     rows = rows_of(connection, "image_id rows cols data", "descriptors")
     for image_id, count, width, blob in rows:
-        if _array(blob, count, width, np.dtype("u1")) is None:
+        descriptors = _array(
+            blob=blob,
+            rows=count,
+            columns=width,
+            dtype=np.dtype("u1"),
+        )
+        if descriptors is None:
             found["descriptor-data"].append(
                 tables.names.get(image_id, f"image {image_id}")
             )
@@ -312,9 +333,9 @@ def keypoint_problems(keypoints: Floats, size: tuple[int, int] | None) -> list[s
 
 def _are_normalised(points: Floats) -> bool:
     """Tell whether (N, 2) keypoints are not in px, but in sides of their image."""
-    return len(points) >= MIN_NORMALISED and bool(
-        np.abs(points).max() <= MAX_NORMALISED
-    )
+    if len(points) < MIN_NORMALISED:
+        return False
+    return bool(np.abs(points).max() <= MAX_NORMALISED)
 
 
 def _are_outside(points: Floats, size: tuple[int, int]) -> bool:
@@ -353,9 +374,8 @@ def _check_pairs(
     connection: sqlite3.Connection, tables: Tables, found: Problems
 ) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
-        for pair_id, rows, columns, blob in rows_of(
-            connection, "pair_id rows cols data", table
-        ):
+        stored = rows_of(connection, "pair_id rows cols data", table)
+        for pair_id, rows, columns, blob in stored:
             image_ids = divmod(pair_id, MAX_NUM_IMAGES)
             matches = _array(blob, rows, columns, np.dtype("<u4"))
             if not _are_matches(matches, image_ids, tables):

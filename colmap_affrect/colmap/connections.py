@@ -11,6 +11,9 @@ from colmap_affrect.geometry.arrays import Indices
 
 T = TypeVar("T", int, str)
 
+# Of a number that tells features of several images apart, for the feature; format
+FEATURE_BITS = 32
+
 
 def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
@@ -33,38 +36,41 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     for first, second in listed:
         partners[first].add(second)
         partners[second].add(first)
-    if not any(
+    may_be_alone = [
         partners[first].isdisjoint(partners[second]) for first, second in listed
-    ):
+    ]
+    if not any(may_be_alone):
         return []  # a third image ties each pair, too
     import networkx
 
     graph: networkx.Graph[T] = networkx.Graph()
     graph.add_edges_from(listed)
-    return [
-        (min(first, second), max(first, second))
-        for first, second in networkx.bridges(graph)
-        if len(partners[first]) > 1 and len(partners[second]) > 1
-    ]
+    found = list[tuple[T, T]]()
+    for first, second in networkx.bridges(graph):
+        if len(partners[first]) > 1 and len(partners[second]) > 1:
+            found.append((min(first, second), max(first, second)))
+    return found
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
     """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
     images = sorted(set(chain.from_iterable(matches)))
-    number = {image: index for index, image in enumerate(images)}
+    numbers = {image: number for number, image in enumerate(images)}
     ends = [np.zeros(0, np.int64)]  # features of first images, then of second ones
     for side in (0, 1):
         for pair, indices in matches.items():
-            ends.append((number[pair[side]] << 32) + indices[:, side])
-    features, index, num_matches = np.unique(
+            image_bits = numbers[pair[side]] << FEATURE_BITS
+            ends.append(image_bits + indices[:, side])
+    features, rows, num_matches = np.unique(
         np.concatenate(ends), return_inverse=True, return_counts=True
     )
-    first, second = index.reshape(2, -1)
-    is_shared = num_matches > 1
-    in_track = is_shared.copy()
-    in_track[first[is_shared[second]]] = True
-    in_track[second[is_shared[first]]] = True
-    counts = np.bincount(features[in_track] >> 32, minlength=len(images)).tolist()
+    first, second = rows.reshape(2, -1)
+    has_two_matches = num_matches > 1
+    in_track = has_two_matches.copy()
+    in_track[first[has_two_matches[second]]] = True
+    in_track[second[has_two_matches[first]]] = True
+    images_in_tracks = features[in_track] >> FEATURE_BITS
+    counts = np.bincount(images_in_tracks, minlength=len(images)).tolist()
     return dict(zip(images, counts, strict=True))
 
 

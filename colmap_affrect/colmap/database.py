@@ -123,7 +123,17 @@ def require_database_space(path: Path, num_new: int) -> None:
 def image_ids(path: Path) -> dict[str, int]:
     """Return the image ids by name; an empty database is made if the file is missing."""
     with open_database(path) as database:
-        return {image.name: image.image_id for image in database.read_all_images()}
+        return ids_of_images(database)
+
+
+def ids_of_images(database: pycolmap.Database) -> dict[str, int]:
+    """Return the ids of the images of a database that is open, by name."""
+    return {image.name: image.image_id for image in database.read_all_images()}
+
+
+def names_of_images(database: pycolmap.Database) -> dict[int, str]:
+    """Return the names of the images of a database that is open, by id."""
+    return {image.image_id: image.name for image in database.read_all_images()}
 
 
 def nearest_positions(
@@ -172,7 +182,7 @@ def spatial_pairs(
 def read_positions(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
     """Return the (3,) positions of the pose priors by image, and why others are none on earth."""
     with open_database(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
+        names = names_of_images(database)
         priors = database.read_all_pose_priors()
     positions = dict[str, Array]()
     wrong = dict[str, str]()
@@ -208,7 +218,7 @@ def generated_pairs(
     """
     pairs = set[tuple[str, str]]()
     with open_database(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
+        names = names_of_images(database)
         for image_id1, image_id2 in kind(options, database).all_pairs():
             first, second = sorted((names[image_id1], names[image_id2]))
             pairs.add((first, second))
@@ -257,12 +267,9 @@ def colmap_keypoints(lafs: Floats) -> Singles:
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one sigma.
     """
     centers = conventions.colmap_from_pixel(lafs[:, :, 2].astype(np.float32))
-    shapes = (
-        (lafs[:, :, :2] / conventions.MEASUREMENT_SIGMAS)
-        .astype(np.float32)
-        .reshape(-1, 4)
-    )
-    return np.concatenate([centers, shapes], axis=1)
+    shapes = lafs[:, :, :2] / conventions.MEASUREMENT_SIGMAS
+    rows = shapes.astype(np.float32).reshape(-1, 4)
+    return np.concatenate([centers, rows], axis=1)
 
 
 def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> bool:
@@ -390,13 +397,12 @@ def fill_descriptors(path: Path, features: FeatureStore) -> None:
     counts = features.num_keypoints()
     names = [name for name in counts if name in ids]
     with open_database(path) as database:
-        num_written = {
-            name: database.num_descriptors_for_image(ids[name]) for name in names
-        }
-        are_stale = [num_written[name] not in (0, counts[name]) for name in names]
-        if any(
-            are_stale
-        ):  # from before an escalation; COLMAP cannot replace single ones
+        num_written = {}
+        for name in names:
+            num_written[name] = database.num_descriptors_for_image(ids[name])
+        # Others are from before an escalation, and COLMAP cannot replace single ones.
+        are_current = all(num_written[name] in (0, counts[name]) for name in names)
+        if not are_current:
             database.clear_descriptors()
             num_written = dict.fromkeys(names, 0)
         for name in names:
@@ -457,11 +463,8 @@ def _check_indices(
     image_id1, image_id2 = image_ids
     if image_id1 == image_id2:
         raise DatabaseError(f"image {image_id1} cannot be matched with itself")
-    if (
-        indices.ndim != 2
-        or indices.shape[1] != 2
-        or not np.issubdtype(indices.dtype, np.integer)
-    ):
+    are_pairs = indices.ndim == 2 and indices.shape[1] == 2
+    if not are_pairs or not np.issubdtype(indices.dtype, np.integer):
         raise DatabaseError(
             f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}"
         )

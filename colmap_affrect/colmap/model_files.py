@@ -33,9 +33,8 @@ MAX_SIDE_PX = 1 << 24
 # Coordinates beyond it are no positions: nothing can be computed with them; damage
 FAR = 1e12
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
-SUMMARY = (
-    "summary.json"  # beside a model of ours; has the digests of its files as ``model``
-)
+# File beside a model of ours, which has the digests of its files as ``model``
+SUMMARY = "summary.json"
 
 
 class _Reader:
@@ -117,9 +116,8 @@ def _point(reader: _Reader) -> None:
     reader.skip(8 * length)
 
 
-RECORDS: dict[
-    str, Callable[[_Reader], Any]
-] = {  # what reads a record of each file of a model
+# Functions that read one record, by file of a model
+RECORDS: dict[str, Callable[[_Reader], Any]] = {
     "cameras.bin": _camera,
     "rigs.bin": _rig,
     "frames.bin": _frame,

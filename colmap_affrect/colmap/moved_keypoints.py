@@ -70,7 +70,12 @@ def images_with_moved_keypoints(
             continue
         matches = np.frombuffer(blob, "<u4").reshape(rows, columns)
         step = max(1, rows // NUM_SAMPLED)
-        share = _fitting_share(images, ids, matches[::step], matrices)
+        share = _fitting_share(
+            images=images,
+            ids=ids,
+            matches=matches[::step],
+            blobs=matrices,
+        )
         if share is not None:
             num_pairs.update(ids)
             if share < MIN_FITTING:

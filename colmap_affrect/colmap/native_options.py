@@ -125,10 +125,8 @@ def _parsed(value: Any, example: Any) -> Any:
     """Return the number, truth value or name of an enumeration that a text stands for."""
     if isinstance(example, bool | int | float) and isinstance(value, str):
         value = json.loads(value.lower())
-        if isinstance(example, bool) and value in (
-            0,
-            1,
-        ):  # as COLMAP's command line has it
+        # COLMAP's command line takes 0 and 1
+        if isinstance(example, bool) and value in (0, 1):
             value = bool(value)
     elif hasattr(type(example), "__members__") and isinstance(value, str):
         value = getattr(type(example), value.upper(), value)

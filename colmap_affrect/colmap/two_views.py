@@ -153,9 +153,8 @@ def significance(
     Returns:
         The logarithm; infinite for a watermark, which cannot be tested.
     """
-    with np.errstate(
-        all="ignore"
-    ):  # points that a camera cannot undistort are no inliers
+    # Points that a camera cannot undistort are no inliers
+    with np.errstate(all="ignore"):
         model = pair_model(geometry, cameras, keypoints)
         if model is None:
             return math.inf
@@ -163,7 +162,12 @@ def significance(
         inliers = rows[model.errors(rows, rows) <= max_error_px]
         hits = model.errors(*random_matches(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
-        alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
+        alarms = log10_false_alarms(
+            num_matches=len(rows),
+            num_inliers=len(inliers),
+            sample_size=model.sample_size,
+            chance=chance,
+        )
         first = telling_shapes(keypoints[0])
         second = telling_shapes(keypoints[1])
         if math.isinf(alarms) or first is None or second is None:

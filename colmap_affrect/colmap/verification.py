@@ -26,9 +26,8 @@ from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 
 Names = tuple[str, str]
-Frames = tuple[
-    Floats, Floats
-]  # (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
+# (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
+Frames = tuple[Floats, Floats]
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many; resource
@@ -131,14 +130,19 @@ def estimate_geometry(
     """
     cameras = (sides[0].camera, sides[1].camera)
     chosen = options.changed(max_error_px=max_error_px(cameras, options, extracted_px))
-    matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
+    matched1 = sides[0].keypoints[matches[:, 0]]
+    matched2 = sides[1].keypoints[matches[:, 1]]
+    matched = (matched1, matched2)
     geometry = _significant_geometry(cameras, matched, chosen)
     if geometry is None:
         return pycolmap.TwoViewGeometry()
     inliers = np.asarray(geometry.inlier_matches)[:, 0]
     if options.min_significance:
-        points = (_positions(matched[0])[inliers], _positions(matched[1])[inliers])
-        written = text_line_matches(*points, (_size(cameras[0]), _size(cameras[1])))
+        written = text_line_matches(
+            _positions(matched1)[inliers],
+            _positions(matched2)[inliers],
+            sizes=(_size(cameras[0]), _size(cameras[1])),
+        )
         if written.mean() > MAX_WRITTEN_SHARE:
             scene = np.delete(matches, inliers[written], axis=0)
             return estimate_geometry(sides, scene, options, extracted_px)
@@ -376,10 +380,17 @@ def verify(
     with colmap_database.open_database(path) as database:
         todo = colmap_database.pairs_to_verify(database)
         if pairs is not None:
-            todo = todo[[tuple(pair) in pairs for pair in todo.tolist()]]
+            may_be_verified = [tuple(pair) in pairs for pair in todo.tolist()]
+            todo = todo[may_be_verified]
         if len(todo):
             colmap_database.require_database_space(path, len(todo))
-            verify_pairs(database, todo, options, extracted_px, advance)
+            verify_pairs(
+                database=database,
+                pairs=todo,
+                options=options,
+                extracted_px=extracted_px,
+                advance=advance,
+            )
 
 
 def verify_pairs(
@@ -419,15 +430,15 @@ def verify_pairs(
             size_px = of_pair(extracted_px, image_ids)
             yield _Task.of(image_ids, sides, matches, size_px)
 
-    found = executor.map(_Estimator(options), tasks())
-    batch = list(islice(found, PAIRS_PER_WRITE))
+    verified = executor.map(_Estimator(options), tasks())
+    batch = list(islice(verified, PAIRS_PER_WRITE))
     while batch:
         with pycolmap.DatabaseTransaction(database):
             for done in batch:
                 database.write_two_view_geometry(*done.image_ids, done.geometry)
         if advance:
             advance(len(batch))
-        batch = list(islice(found, PAIRS_PER_WRITE))
+        batch = list(islice(verified, PAIRS_PER_WRITE))
 
 
 def _each_once(matches: Matches) -> Matches:
@@ -472,7 +483,8 @@ class PairVerifier:
         """
         geometry = self.geometry(names, frames, indices)
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-        return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
+        is_in_order = self._ids[names[0]] < self._ids[names[1]]
+        return found if is_in_order else found[:, ::-1]
 
     def geometry(
         self, names: Names, frames: Frames, indices: Matches
@@ -494,7 +506,12 @@ class PairVerifier:
             sides = (sides[1], sides[0])
             indices = indices[:, ::-1]
         size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry(sides, indices, self._options, size_px)
+        return estimate_geometry(
+            sides=sides,
+            matches=indices,
+            options=self._options,
+            extracted_px=size_px,
+        )
 
     def _side(self, name: str, lafs: Floats) -> Side:
         return Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))

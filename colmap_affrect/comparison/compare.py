@@ -101,8 +101,16 @@ def _compare(
     truth = _ground_truth(options.ground_truth_path, names)
     options = options.changed(mapping=MAPPERS.make(options.mapping).options)
     common = _common_record(inputs, names, pairs, options)
-    folders = (resolved(output_path), resolved(image_path))
-    runs = [MethodRun(method, *folders, options, common) for method in methods]
+    runs = list[MethodRun]()
+    for method in methods:
+        run = MethodRun(
+            method=method,
+            output_path=resolved(output_path),
+            image_path=resolved(image_path),
+            options=options,
+            inputs=common,
+        )
+        runs.append(run)
     _resolve_weights(runs, options, progress, overwrite=again)
     with workspace.locked():
         num_images = len(names) + len(pairs) / PAIRS_PER_IMAGE
@@ -162,7 +170,7 @@ def _run_methods(
     """
     for run in runs:
         run.begin(overwrite=overwrite)
-    left_s = {}  # by the label of a method that is to be run, as estimated
+    left_s = dict[str, float]()  # estimated, by the label of a method that is to be run
     for run in runs:
         if not run.finished():
             left_s[run.method.label] = num_images * run.seconds_per_image
@@ -175,17 +183,20 @@ def _run_methods(
         title = f"method {number} of {len(runs)}, {label}: "
         failed = ""
         if label in left_s:
-            if progress.stream:
-                minutes = max(1.0, pace * sum(left_s.values()) / 60)
-                show(
-                    f"{title}about {minutes:.0f} min left for all", file=progress.stream
-                )
+            _show_time_left(title, pace * sum(left_s.values()), progress)
             failed = run_alone(run, title, progress)
             del left_s[label]
             pace = (time.monotonic() - start_s) / (total_s - sum(left_s.values()))
         result = run.finished() or replace(run.result, seeds=())
         results.append(replace(result, failed=failed or result.failed))
     return results
+
+
+def _show_time_left(title: str, left_s: float, progress: Progress) -> None:
+    """Say how long all methods still take, where somebody looks at it."""
+    if progress.stream:
+        minutes = max(1.0, left_s / 60)
+        show(f"{title}about {minutes:.0f} min left for all", file=progress.stream)
 
 
 def _checked_inputs(

@@ -49,7 +49,7 @@ from colmap_affrect.project.paths import GivenPath, PathLike
 from colmap_affrect.project.reasons import texts_of
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.regular_files import read_regular
-from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.report import ModelSummary, largest_of
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import AnyMapper, Recipe
 from colmap_affrect.session.context import Context
@@ -223,10 +223,9 @@ class MethodRun:
     def result(self) -> MethodResult:
         """What is done of the method, as it is on disk."""
         # A result of an older version is not valid: then features stay, and models are made again.
+        path = self.workspace.path / "result.json"
         with suppress(FileNotFoundError, ValidationError):
-            return RESULT_JSON.validate_json(
-                read_regular(self.workspace.path / "result.json")
-            )
+            return RESULT_JSON.validate_json(read_regular(path))
         return MethodResult(
             self.method.label,
             summary=self.method.summary,
@@ -364,18 +363,9 @@ class MethodRun:
             new.mkdir()
             database_path = new / "database.db"
             copy_database(self.database, database_path)
-            models = self._models(seed, new, watch, progress)
+            models = self._models(seed, folder=new, watch=watch, progress=progress)
             verified = verified_pairs(database_path, self.verification.min_num_inliers)
-        largest = (
-            models[0]
-            if models
-            else ModelSummary(
-                registered_names=(),
-                num_points3D=0,
-                mean_track_length=0.0,
-                mean_reprojection_error_px=0.0,
-            )
-        )
+        largest = largest_of(models)
         return SeedResult(
             seed=seed,
             models=tuple(item.registered_names for item in models),
@@ -446,8 +436,8 @@ class MethodRun:
         shutil.copy(self.workspace.cameras, folder)
         mapper = MAPPERS.make(self.mapping.changed(random_seed=seed))
         task = MappingTask(
-            path,
-            self.image_path,
+            database_path=path,
+            image_path=self.image_path,
             cameras=read_camera_records(self.workspace.cameras),
             may_share=self.options.inputs(self.image_path).may_share,
         )

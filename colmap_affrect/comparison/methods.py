@@ -135,7 +135,6 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     if recipe.extraction.uses_depth:
         recipe = load_recipe(name, [*changes, *depth_settings])
     if not label:
-        label = (
-            text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
-        )
+        is_file = name.endswith(".toml")
+        label = text.replace(name, PurePath(name).stem) if is_file else text
     return Method(label, recipe)

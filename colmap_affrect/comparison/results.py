@@ -75,9 +75,8 @@ def pose_scores(
     Returns:
         Which images are registered correctly, and how far the others are off.
     """
-    errors = pair_errors(
-        estimated, {name: truth[name] for name in truth.keys() & image_names}
-    )
+    scored = {name: truth[name] for name in truth.keys() & image_names}
+    errors = pair_errors(estimated, scored)
     correct = correct_images(errors)
     names = set(itertools.chain.from_iterable(errors))
     rotations_deg = [rotation_deg for rotation_deg, _ in errors.values()]
@@ -233,7 +232,8 @@ class MethodResult:
         """Images registered correctly; without ground truth those of high confidence."""
         counts = []
         for seed in self.seeds:
-            counts.append(len(seed.scores.correct_names if seed.scores else seed.sure))
+            names = seed.scores.correct_names if seed.scores else seed.sure
+            counts.append(len(names))
         return Span.of(counts)
 
     @property

@@ -35,12 +35,11 @@ def run_alone(run: MethodRun, title: str, progress: Progress) -> str:
     command = [sys.executable, "-P", "-m", __name__, str(os.getpid())]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with log_path.open("a", encoding="utf-8") as log:
+        # With many photographs the input is too long for an argument.
         code = subprocess.run(  # noqa: S603  (this Python and this module)
             command,
             check=False,
-            input=pickle.dumps(
-                (run, title)
-            ),  # too long for an argument, with many photographs
+            input=pickle.dumps((run, title)),
             stdout=progress.file_number,
             stderr=log,
             env=environment,

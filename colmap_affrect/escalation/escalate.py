@@ -26,9 +26,9 @@ from colmap_affrect.escalation.expected_gain import PairState, Step
 from colmap_affrect.escalation.policy import (
     Plan,
     learned_step,
+    matched_by_level,
     next_step,
-    tried,
-    untried,
+    untried_by_level,
 )
 from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.options import EffortName
@@ -61,13 +61,12 @@ def escalate(context: Context, options: EscalateOptions | None = None) -> StageR
     Returns:
         What was done; ``num_done`` counts the pairs that were matched again now.
     """
-    escalation, report = begin(context, options)
-    return escalation.final_report(escalation.take_steps(report))
+    escalation = begin(context, options)
+    escalation.take_steps()
+    return escalation.final_report()
 
 
-def begin(
-    context: Context, options: EscalateOptions | None = None
-) -> tuple["Escalation", StageReport]:
+def begin(context: Context, options: EscalateOptions | None = None) -> "Escalation":
     """Return what lets pairs escalate; the database is brought up to what a killed run stored."""
     start = time.perf_counter()
     context.resources.require_device()
@@ -79,35 +78,36 @@ def begin(
     escalation = Escalation(context, options)
     if escalation.has_begun:
         escalation.write()
-    return escalation, StageReport(
-        name="escalate", wall_s=time.perf_counter() - start, num_done=0
-    )
+    escalation.add_to_report(time.perf_counter() - start, num_pairs=0)
+    return escalation
 
 
 @dataclass(frozen=True)
-class Tried:
+class EscalationSummary:
     """What escalation did for a set, and what is left."""
 
     effort: EffortName = "normal"  # how much was tried
-    tried: tuple[MatchedAgain, ...] = ()  # pairs by level
+    matched_again: tuple[MatchedAgain, ...] = ()  # pairs by level
     untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try
 
 
-def matched_again(context: Context) -> Tried:
+def escalation_summary(context: Context) -> EscalationSummary:
     """Return what escalation did in a workspace, and what is left for images to match again."""
     workspace = context.workspace
     if workspace.is_foreign or "escalate" not in workspace.started_stages:
-        return Tried()
+        return EscalationSummary()
     escalation = Escalation(context, context.escalation)
     state = escalation.state
     models = state.models()
     weights = state.weights(models)
     if not (weights or escalation.has_begun):  # large sets take long to go through
-        return Tried()
+        return EscalationSummary()
     situation = state.situation(weights, models)
     effort = escalation.matches.state.effort or context.effort
-    return Tried(
-        effort=effort, tried=tuple(tried(situation)), untried=tuple(untried(situation))
+    return EscalationSummary(
+        effort=effort,
+        matched_again=tuple(matched_by_level(situation)),
+        untried=tuple(untried_by_level(situation)),
     )
 
 
@@ -136,6 +136,7 @@ class Escalation:
         state: what is known of its images and pairs.
         matches: its raw matches.
         left_s: seconds that all steps to come may take, if nothing helps any more.
+        report: pairs and seconds of what was done so far.
     """
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
@@ -149,6 +150,7 @@ class Escalation:
         self.state = SetState(context, options)
         self.matches = context.matches
         self.left_s = 0.0
+        self.report = StageReport(name="escalate", wall_s=0.0, num_done=0)
 
     @cached_property
     def extractor(self) -> ImageExtractor:
@@ -210,30 +212,34 @@ class Escalation:
             return Plan()
         return next_step(self.state.situation(weights, models), self.context.effort)
 
-    def take_steps(
-        self, report: StageReport, before_each: Callable[[], None] = lambda: None
-    ) -> StageReport:
+    def take_steps(self, before_each: Callable[[], None] = lambda: None) -> None:
         """Take steps until none is left.
 
         Args:
-            report: of what was done before.
             before_each: called before each step.
-
-        Returns:
-            The report with the pairs and seconds of the steps.
         """
         step = self.next_step()
         while step:
             before_each()
             start = time.perf_counter()
             self.match_at(step.pairs, step.level)
-            wall_s = report.wall_s + time.perf_counter() - start
-            num_done = report.num_done + len(step.pairs)
-            report = StageReport(name="escalate", wall_s=wall_s, num_done=num_done)
+            self.add_to_report(time.perf_counter() - start, len(step.pairs))
             step = self.next_step()
-        return report
 
-    def final_report(self, report: StageReport) -> StageReport:
+    def add_to_report(self, seconds: float, num_pairs: int) -> None:
+        """Count what was done.
+
+        Args:
+            seconds: that it took.
+            num_pairs: pairs that were matched again.
+        """
+        self.report = StageReport(
+            name="escalate",
+            wall_s=self.report.wall_s + seconds,
+            num_done=self.report.num_done + num_pairs,
+        )
+
+    def final_report(self) -> StageReport:
         """Return the report with what could not be tried, which is logged, too."""
         warned = self._missing_weights()
         if self.is_over_time:
@@ -242,8 +248,8 @@ class Escalation:
             logger.warning("%s", warning.line())
         return StageReport(
             name="escalate",
-            wall_s=report.wall_s,
-            num_done=report.num_done,
+            wall_s=self.report.wall_s,
+            num_done=self.report.num_done,
             warned=tuple(warned),
         )
 

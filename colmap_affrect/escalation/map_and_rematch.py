@@ -6,7 +6,6 @@ best ones so far are gone back to in the end (:mod:`colmap_affrect.escalation.al
 """
 
 import time
-from dataclasses import replace
 from functools import partial
 
 from colmap_affrect.escalation.alternatives import (
@@ -44,19 +43,17 @@ def map_and_rematch(
     Returns:
         What each step did.
     """
-    escalation, escalated = begin(context, recipe.escalate)
+    escalation = begin(context, recipe.escalate)
     adopt_chosen_models(escalation)
     reports = _map_first(context, mapper, recipe)
-    escalated = _try_learned_matches(escalation, mapper, escalated)
+    _try_learned_matches(escalation, mapper)
     is_chosen = choose_learned(escalation, at_once=True)
     is_untouched = not is_chosen and not escalation.has_stepped
     if is_untouched and context.matches.state.learned_matching:
         update_keypoints_of_models(context)
     goes_on = True
     while goes_on:
-        escalated = escalation.take_steps(
-            escalated, before_each=partial(keep_best, context)
-        )
+        escalation.take_steps(before_each=partial(keep_best, context))
         before = context.workspace.model_inputs()
         reports += _map_on(context, mapper, recipe)
         # Nothing changes where no pair makes a model, or all are mapped.
@@ -67,22 +64,19 @@ def map_and_rematch(
             or choose_learned(escalation, at_once=False)
         )
     remove_alternatives(context)
-    return [*reports, escalation.final_report(escalated)]
+    return [*reports, escalation.final_report()]
 
 
-def _try_learned_matches(
-    escalation: Escalation, mapper: Mapper, report: StageReport
-) -> StageReport:
+def _try_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
     """Match pairs of a small set by learned matching, once, and map with these matches alone."""
     context = escalation.context
     if not needs_learned_models(context) or not escalation.plan_learned_matching():
-        return report
+        return
     start = time.perf_counter()
     num_matched = escalation.match_learned()
     if escalation.has_all_learned_matches:
         map_learned_matches(escalation, mapper)
-    wall_s = report.wall_s + time.perf_counter() - start
-    return replace(report, wall_s=wall_s, num_done=report.num_done + num_matched)
+    escalation.add_to_report(time.perf_counter() - start, num_matched)
 
 
 def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:

@@ -25,9 +25,10 @@ from colmap_affrect.escalation.expected_gain import (
     kind_of,
     statistics_of,
 )
+from colmap_affrect.forecast import Forecast
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.progress import Forecast
+from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
@@ -237,7 +238,11 @@ class Situation:
 
 
 def forecast_of(
-    levels: Sequence[Level], usable: Collection[int], num_images: int, num_pairs: int
+    levels: Sequence[Level],
+    usable: Collection[int],
+    num_images: int,
+    num_pairs: int,
+    megapixels: float = 0.0,
 ) -> Forecast:
     """Return what forecasts a run, with what may follow its first model.
 
@@ -246,13 +251,19 @@ def forecast_of(
         usable: numbers of those whose weights are there.
         num_images: photographs of the set.
         num_pairs: pairs of the set.
+        megapixels: of all photographs, at the size of processing.
     """
     num_learned = 0  # of a larger set learned matching takes no longer than the rest
     for number in usable:
         if kind_of(levels[number]) == LEARNED and number > 0 and num_images <= SMALL:
             num_learned = num_pairs
     return Forecast(
-        num_images, num_pairs, num_learned_pairs=num_learned, goes_on=len(levels) > 1
+        num_images,
+        num_pairs,
+        num_learned_pairs=num_learned,
+        goes_on=len(levels) > 1,
+        megapixels=megapixels,
+        num_cores=available_cores(),
     )
 
 
@@ -324,8 +335,8 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
     return Plan(max(hopeful, key=lambda step: step.rate), min(left_s, all_s))
 
 
-def tried(situation: Situation) -> list[MatchedAgain]:
-    """Return for how many pairs each level of escalation was tried."""
+def matched_by_level(situation: Situation) -> list[MatchedAgain]:
+    """Return how many pairs were matched again at each level of escalation, if any."""
     found = list[MatchedAgain]()
     for number in range(1, len(situation.levels)):
         pairs = situation.pairs_tried(number)
@@ -336,7 +347,7 @@ def tried(situation: Situation) -> list[MatchedAgain]:
     return found
 
 
-def untried(situation: Situation) -> list[MatchedAgain]:
+def untried_by_level(situation: Situation) -> list[MatchedAgain]:
     """Return what a greater effort would try for images to match again, by level."""
     found = list[MatchedAgain]()
     for number in situation.usable:

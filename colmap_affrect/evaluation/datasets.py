@@ -84,23 +84,31 @@ def load_evd(folder: Path) -> Pairs:
         for file in (folder / part).glob("*"):
             if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES):
                 names.add(file.stem)
-    entries = [
-        _evd_entry(
-            folder=folder,
-            name=n,
-            stem1=f"1/{n}",
-            stem2=f"2/{n}",
-            homography=f"h/{n}.txt",
+    entries = list[_Entry]()
+    for name in sorted(names):
+        entries.append(
+            _evd_entry(
+                folder=folder,
+                name=name,
+                stem1=f"1/{name}",
+                stem2=f"2/{name}",
+                homography=f"h/{name}.txt",
+            )
         )
-        for n in sorted(names)
-    ]
     for file in sorted(folder.glob("H_*.txt")):
         parts = re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem)
         if parts:
             scene, view1, view2 = parts.groups()
             name = f"{scene} {view1}-{view2}"
-            images = (f"{scene}_{view1}", f"{scene}_{view2}")
-            entries.append(_evd_entry(folder, name, *images, file.name))
+            entries.append(
+                _evd_entry(
+                    folder=folder,
+                    name=name,
+                    stem1=f"{scene}_{view1}",
+                    stem2=f"{scene}_{view2}",
+                    homography=file.name,
+                )
+            )
     if not entries:
         layouts = "1/NAME.png, 2/NAME.png, h/NAME.txt nor NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
         raise OptionError(f"holds neither {layouts}", where=folder)
@@ -113,11 +121,8 @@ def _evd_entry(
     """Return a pair of images by their paths without suffix."""
     paths = []
     for path in (stem1, stem2):
-        known = [
-            path + suffix
-            for suffix in IMAGE_SUFFIXES
-            if (folder / (path + suffix)).is_file()
-        ]
+        possible = [path + suffix for suffix in IMAGE_SUFFIXES]
+        known = [name for name in possible if (folder / name).is_file()]
         paths.append(known[0] if known else f"{path}.png")
     return _Entry(name=name, image1=paths[0], image2=paths[1], homography=homography)
 

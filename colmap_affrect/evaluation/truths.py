@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean, median_low
+from statistics import fmean
 from typing import Annotated, Any
 
 import cv2
@@ -117,10 +117,12 @@ def estimate_matrix(
     """
     count = len(points[0])
     is_homography = find is cv2.findHomography
-    if count < (MIN_HOMOGRAPHY_MATCHES if is_homography else MIN_FUNDAMENTAL_MATCHES):
+    least = MIN_HOMOGRAPHY_MATCHES if is_homography else MIN_FUNDAMENTAL_MATCHES
+    if count < least:
         return None, 0
     order = np.random.default_rng(options.random_seed).permutation(count)
-    first, second = (np.asarray(side, dtype=np.float64)[order] for side in points)
+    first = np.asarray(points[0], dtype=np.float64)[order]
+    second = np.asarray(points[1], dtype=np.float64)[order]
     matrix, inliers = find(
         first,
         second,
@@ -151,7 +153,8 @@ def estimate_pose(
     if len(usable) < MIN_POSE_MATCHES:
         return None, 0
     order = np.random.default_rng(options.random_seed).permutation(usable)
-    first, second = (np.ascontiguousarray(side[order]) for side in rays)
+    first = np.ascontiguousarray(rays[0][order])
+    second = np.ascontiguousarray(rays[1][order])
     essential, mask = cv2.findEssentialMat(
         first,
         second,
@@ -217,11 +220,8 @@ class TrueHomography:
         width, height = self.size1
         columns = np.arange(0, width, GRID_STEP_PX)
         rows = np.arange(0, height, GRID_STEP_PX)
-        points = (
-            np.stack(np.meshgrid(columns, rows), axis=-1)
-            .reshape(-1, 2)
-            .astype(np.float64)
-        )
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+        points = grid.reshape(-1, 2).astype(np.float64)
         points = points[third_coordinates(self.matrix, points) > 0]
         return points[is_inside(project(self.matrix, points), self.size2)]
 
@@ -363,7 +363,7 @@ class Correspondences:
             The score. Its error is the median of the symmetric epipolar distances of the
             correspondences in px, and the pair is solved as far as :func:`wxbs_score` says.
         """
-        estimates = []  # error, number of inliers, seed, distances; seeds differ
+        estimates = list[_Estimate]()
         for seed in range(options.random_seed, options.random_seed + NUM_ESTIMATES):
             matrix, num_inliers = estimate_matrix(
                 find=cv2.findFundamentalMat,
@@ -373,13 +373,29 @@ class Correspondences:
                 options=options.changed(random_seed=seed),
             )
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
-            estimates.append(
-                (float(np.median(distances)), num_inliers, seed, distances)
-            )
-        error, num_inliers, _, distances = median_low(estimates)
+            estimates.append(_Estimate(distances, num_inliers))
+        # Sorting keeps the order of seeds where all else is equal.
+        estimates.sort(key=lambda estimate: (estimate.error_px, estimate.num_inliers))
+        median = estimates[(len(estimates) - 1) // 2]
         return PairScore(
-            error, num_inliers, solved=wxbs_score(distances), kind="correspondences"
+            error=median.error_px,
+            num_inliers=median.num_inliers,
+            solved=wxbs_score(median.distances_px),
+            kind="correspondences",
         )
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """A fundamental matrix by some order of the matches."""
+
+    distances_px: Array  # (N,) of correspondences
+    num_inliers: int
+
+    @property
+    def error_px(self) -> float:
+        """The median of the distances."""
+        return float(np.median(self.distances_px))
 
 
 def symmetric_epipolar_distances(

@@ -1,5 +1,7 @@
 """Names for types of arrays. Docstrings say which shapes and units the arrays have."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,11 @@ Indices = NDArray[np.int64]
 Integers = NDArray[np.integer]  # of any width
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+
+
+def sampling_step(num_items: int, max_num: int) -> int:
+    """Return the step with which at most so many items are taken, 1 where there are no more."""
+    return max(1, math.ceil(num_items / max_num))
 
 
 def rows_in(rows: Indices, others: Indices) -> Bools:

@@ -179,10 +179,19 @@ class Lines:
         rotation = self.likelihood.rotations[row, column]
         segments = self.segments.undistorted(self.likelihood.distortion)
         fit = VanishingFit(
-            segments, rotation[None], np.array([focal]), np.array([shift])
+            segments=segments,
+            rotations=rotation[None],
+            focals=np.array([focal]),
+            shifts=np.array([shift]),
         )
         evidence = float(self.likelihood.log_likelihoods[row, column])
-        return Explanation(focal, shift, rotation, fit.kinds()[0], evidence)
+        return Explanation(
+            focal=focal,
+            shift=shift,
+            rotation=rotation,
+            kinds=fit.kinds()[0],
+            evidence=evidence,
+        )
 
 
 def measure_lines(segments: Segments) -> Lines:
@@ -259,26 +268,25 @@ def _likeliest(chances: Floats) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def line_likelihood(segments: Segments, random_seed: int = 0) -> LineLikelihood | None:
+def line_likelihood(segments: Segments) -> LineLikelihood | None:
     """Return how likely focal lengths and shifts are by the straight lines of a photograph.
 
     Args:
         segments: of the photograph.
-        random_seed: of the frames that are tried.
 
     Returns:
         The likelihood; None where there are too few segments to say anything.
     """
     if len(segments) < MIN_NUM_SEGMENTS:
         return None
-    lens = _likeliest_lens(segments, random_seed)
+    lens = _likeliest_lens(segments)
     grid = (len(FOCALS), len(SHIFTS))
     rotations, scores = refined(
-        segments.undistorted(lens.distortion),
-        np.repeat(lens.rotations, len(SHIFTS), axis=0),
-        np.repeat(FOCALS, len(SHIFTS)),
-        np.tile(SHIFTS, len(FOCALS)),
-        NUM_STEPS_FROM_THERE,
+        segments=segments.undistorted(lens.distortion),
+        rotations=np.repeat(lens.rotations, len(SHIFTS), axis=0),
+        focals=np.repeat(FOCALS, len(SHIFTS)),
+        shifts=np.tile(SHIFTS, len(FOCALS)),
+        num_steps=NUM_STEPS_FROM_THERE,
     )
     log_likelihoods = (scores.reshape(grid) + lens.of_others[:, None]) / TEMPER
     return LineLikelihood(
@@ -302,16 +310,20 @@ class _Lens:
     of_others: Floats
 
 
-def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
+def _likeliest_lens(segments: Segments) -> _Lens:
     """Compare distortions; the frames of each are found from those of a lens without any."""
-    starts = _rotations_of_centred_cameras(segments, random_seed)
+    starts = _rotations_of_centred_cameras(segments)
     no_shift = np.zeros(len(FOCALS))
     rotations = np.empty((len(DISTORTIONS), *starts.shape))
     scores = np.empty((len(DISTORTIONS), len(FOCALS)))
     for number, distortion in enumerate(DISTORTIONS):
         straight = segments.undistorted(float(distortion))
         rotations[number], scores[number] = refined(
-            straight, starts, FOCALS, no_shift, NUM_STEPS_FROM_THERE
+            segments=straight,
+            rotations=starts,
+            focals=FOCALS,
+            shifts=no_shift,
+            num_steps=NUM_STEPS_FROM_THERE,
         )
     best = int(scores.max(axis=1).argmax())
     means = np.logaddexp.reduce(scores, axis=0) - math.log(len(DISTORTIONS))
@@ -319,33 +331,39 @@ def _likeliest_lens(segments: Segments, random_seed: int) -> _Lens:
     return _Lens(float(DISTORTIONS[best]), rotations[best], np.asarray(of_others))
 
 
-def _rotations_of_centred_cameras(segments: Segments, random_seed: int) -> Floats:
+def _rotations_of_centred_cameras(segments: Segments) -> Floats:
     """Return the (F, 3, 3) rotations that explain most, without a shift and a distortion."""
-    starts = _first_rotations(segments, random_seed)
+    starts = _first_rotations(segments)
     focals = np.repeat(FOCALS, NUM_KEPT)
     found, scores = refined(
-        segments, starts.reshape(-1, 3, 3), focals, np.zeros(len(focals)), NUM_STEPS
+        segments=segments,
+        rotations=starts.reshape(-1, 3, 3),
+        focals=focals,
+        shifts=np.zeros(len(focals)),
+        num_steps=NUM_STEPS,
     )
     best = scores.reshape(-1, NUM_KEPT).argmax(axis=1)
     return np.asarray(found.reshape(-1, NUM_KEPT, 3, 3)[np.arange(len(best)), best])
 
 
-def _first_rotations(segments: Segments, random_seed: int) -> Floats:
+def _first_rotations(segments: Segments) -> Floats:
     """Return the (F, K, 3, 3) best of many frames for each focal length."""
     longest = segments.longest(NUM_SEGMENTS_OF_TRIALS)
-    random = np.random.default_rng(random_seed)
+    random = np.random.default_rng(0)
     importance = longest.weights * longest.lengths
     chances = importance / importance.sum()
     chosen = random.choice(len(longest), (NUM_TRIALS, 3), p=chances)
     no_shift = np.zeros(NUM_TRIALS)
     kept = np.empty((len(FOCALS), NUM_KEPT, 3, 3))
     for number, focal in enumerate(FOCALS):
-        normals = _unit(
-            longest.lines * [focal, focal, 1.0]
-        )  # of planes with the camera's centre
+        # Of planes with the camera's centre
+        normals = _unit(longest.lines * [focal, focal, 1.0])
         rotations = _frames(normals[chosen])
         scores = VanishingFit(
-            longest, rotations, np.full(NUM_TRIALS, focal), no_shift
+            segments=longest,
+            rotations=rotations,
+            focals=np.full(NUM_TRIALS, focal),
+            shifts=no_shift,
         ).scores()
         kept[number] = rotations[np.argsort(-scores, kind="stable")[:NUM_KEPT]]
     return kept

@@ -3,12 +3,18 @@
 All points are (N, 2) px with the corner of the image at (0, 0). Sizes are (width, height) px.
 """
 
-import math
-
 import cv2
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import (
+    Array,
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Singles,
+    sampling_step,
+)
 from colmap_affrect.geometry.conventions import pixel_from_colmap, resized_from_original
 
 Size = tuple[int, int]
@@ -78,7 +84,12 @@ def pure_rotation_ratio(
     for focal_ratio in FOCAL_LENGTHS:
         focal_px = focal_ratio * max(sizes[0])
         lenses += [(focal_px, zoom) for zoom in zooms]
-    ratios = _rotation_ratios(centered1, centered2, np.array(lenses), error)
+    ratios = _rotation_ratios(
+        points1=centered1,
+        points2=centered2,
+        lenses=np.array(lenses),
+        error=error,
+    )
     return float(ratios.max())
 
 
@@ -118,11 +129,17 @@ def _rotation_ratios(
     # Lens by lens: what stays in the cache of a core is four times as fast.
     for index, focal2 in enumerate(focals2):
         start_errors = _rotation_errors(
-            starts_32[index], columns1_32[index], points2_32, float(focal2)
+            rotations=starts_32[index],
+            columns1=columns1_32[index],
+            points2=points2_32,
+            focal2=float(focal2),
         )
         best_start = _medians(start_errors).argmin()
         errors[index] = _rotation_errors(
-            starts[index, best_start, None], columns1[index], points2, float(focal2)
+            rotations=starts[index, best_start, None],
+            columns1=columns1[index],
+            points2=points2,
+            focal2=float(focal2),
         )[0]
     for _ in range(MAX_ITERATIONS):
         limits = np.maximum(error, _medians(errors))
@@ -131,7 +148,12 @@ def _rotation_ratios(
         for index, focal2 in enumerate(focals2):
             rotation = rotations[index, None]
             columns = columns1[index]
-            errors[index] = _rotation_errors(rotation, columns, points2, focal2)[0]
+            errors[index] = _rotation_errors(
+                rotations=rotation,
+                columns1=columns,
+                points2=points2,
+                focal2=focal2,
+            )[0]
     return np.asarray((errors <= error).mean(axis=1))
 
 
@@ -203,8 +225,7 @@ def _rays(points: Array) -> Array:
 
 def _sampled(points: Array) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
-    step = max(1, math.ceil(len(points) / MAX_NUM_POINTS))
-    return points[::step]
+    return points[:: sampling_step(len(points), MAX_NUM_POINTS)]
 
 
 def text_line_matches(
@@ -235,10 +256,9 @@ def text_line_matches(
     if inliers is None or not inliers.any():
         return nothing
     on_line = inliers.ravel() > 0
-    are_lines = _is_text_line(points1[on_line], sizes[0]) and _is_text_line(
-        points2[on_line], sizes[1]
-    )
-    return on_line if are_lines else nothing
+    is_line1 = _is_text_line(points1[on_line], sizes[0])
+    is_line2 = _is_text_line(points2[on_line], sizes[1])
+    return on_line if is_line1 and is_line2 else nothing
 
 
 def _is_text_line(points: Array, size: Size) -> bool:
@@ -331,14 +351,15 @@ def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -
         The larger ratio of both axes.
     """
     if len(points2) < len(points1):
-        points1, points2, sizes = points2, points1, sizes[::-1]
+        return mirrored_share(points2, points1, (sizes[1], sizes[0]))
     size1, size2 = sizes
     if not len(points1):
         return 0.0
-    is_keypoint = np.zeros(
-        (size1[1] + 2 * MARGIN_PX, size1[0] + 2 * MARGIN_PX), np.uint8
-    )
-    is_keypoint[_pixels(points2 * np.divide(size1, size2), size1)] = 1
+    height = size1[1] + 2 * MARGIN_PX
+    width = size1[0] + 2 * MARGIN_PX
+    is_keypoint = np.zeros((height, width), np.uint8)
+    in_first = points2 * np.divide(size1, size2)
+    is_keypoint[_pixels(in_first, size1)] = 1
     is_near = np.asarray(cv2.dilate(is_keypoint, np.ones((3, 3), np.uint8)))
     ratios = [0.0]
     for axis in (0, 1):

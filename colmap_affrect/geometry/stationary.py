@@ -11,7 +11,7 @@ import math
 import cv2
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, sampling_step
 from colmap_affrect.geometry.neighbors import MAX_RELATIVE_ERROR
 
 MAX_SHEET_ROTATION = 0.01
@@ -88,7 +88,7 @@ def num_moving_together(points: Floats, motions: Floats, radius_px: float) -> in
     Returns:
         The number of matches, extrapolated from those that are looked at.
     """
-    step = _sampling_step(len(points))
+    step = sampling_step(len(points), MAX_COMPARED)
     sampled_points = points[::step]
     sampled_motions = motions[::step]
     distances = np.linalg.norm(sampled_points[:, None] - sampled_points, axis=2)
@@ -97,11 +97,6 @@ def num_moving_together(points: Floats, motions: Floats, radius_px: float) -> in
     is_similar = differences <= MAX_RELATIVE_ERROR * distances
     has_companion = (is_near & is_similar).any(axis=1)
     return int(step * np.count_nonzero(has_companion))
-
-
-def _sampling_step(num: int) -> int:
-    """Return the step by which at most ``MAX_COMPARED`` of some values are taken."""
-    return max(1, math.ceil(num / MAX_COMPARED))
 
 
 def _common_motions(points: Floats, motions: Floats, tolerance_px: float) -> Array:
@@ -117,7 +112,7 @@ def _common_motions(points: Floats, motions: Floats, tolerance_px: float) -> Arr
     """
     if not len(motions):
         return np.zeros((0, 2))
-    sampled = motions[:: _sampling_step(len(motions))]
+    sampled = motions[:: sampling_step(len(motions), MAX_COMPARED)]
     is_near = np.linalg.norm(sampled[:, None] - sampled, axis=2) <= tolerance_px
     densest = is_near.sum(axis=1).argmax()
     shift = sampled[is_near[densest]].mean(axis=0)

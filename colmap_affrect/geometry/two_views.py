@@ -85,8 +85,13 @@ def homogeneous(points: Floats) -> Array:
 
 def essential_matrix(rotation: Array, translation: Array) -> Array:
     """Return E with ``x2^T E x1 = 0`` for homogeneous rays."""
-    x, y, z = translation
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    return cross_product_matrix(translation) @ rotation
+
+
+def cross_product_matrix(vector: Array) -> Array:
+    """Return the (3, 3) matrix that maps others to the cross product of a (3,) vector with them."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,12 @@ def scale_between(
     """
     known_points, known_depths = known
     points, depths = observed
-    neighbors = _nearest_known(known_points, points, radius_px, NUM_NEIGHBORS)
+    neighbors = _nearest_known(
+        known=known_points,
+        points=points,
+        radius_px=radius_px,
+        count=NUM_NEIGHBORS,
+    )
     log_ratios = np.log(known_depths[neighbors.known] / depths[neighbors.rows])
     weights = np.exp(-((2 * neighbors.distances / radius_px) ** 2))
     return _densest_scale(neighbors.rows, log_ratios, weights)
@@ -146,7 +156,12 @@ def scale_by_planes(
     """
     known_points, known_depths = known
     points, depths = observed
-    neighbors = _nearest_known(known_points, points, radius_px, NUM_ON_PLANE)
+    neighbors = _nearest_known(
+        known=known_points,
+        points=points,
+        radius_px=radius_px,
+        count=NUM_ON_PLANE,
+    )
     counts = np.bincount(neighbors.rows, minlength=len(points))
     rows = np.flatnonzero(counts == NUM_ON_PLANE)
     chosen = neighbors.known[np.isin(neighbors.rows, rows)].reshape(-1, NUM_ON_PLANE)

@@ -16,12 +16,12 @@ MAX_LEAN = math.radians(45.0)
 MIN_COMMON = 0.3
 
 
-def agreed_up(directions: Floats, held: Floats) -> tuple[Floats, Bools] | None:
+def agreed_up(directions: Floats, image_ups: Floats) -> tuple[Floats, Bools] | None:
     """Return the direction that most photographs agree on.
 
     Args:
         directions: (N, 3) unit vectors upwards, by the lines of each photograph, in one frame.
-        held: (M, 3) unit vectors upwards in the images of all cameras, in the same frame.
+        image_ups: (M, 3) unit vectors upwards in the images of all cameras, in the same frame.
 
     Returns:
         (3,) unit vector upwards, and (N,) which photographs agree; None where they contradict each
@@ -36,7 +36,7 @@ def agreed_up(directions: Floats, held: Floats) -> tuple[Floats, Bools] | None:
         return None
     mean = directions[agrees].mean(axis=0)
     up = mean / np.linalg.norm(mean)
-    common = held.mean(axis=0)
+    common = image_ups.mean(axis=0)
     length = float(np.linalg.norm(common))
     if length >= MIN_COMMON and float(up @ common) < length * math.cos(MAX_LEAN):
         return None

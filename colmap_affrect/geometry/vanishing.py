@@ -52,10 +52,9 @@ class VanishingFit:
         self.focals = focals
         self.shifts = shifts
         points = self._vanishing_points(rotations)
-        self.distances = self._distances(
-            points
-        )  # (K, 3, N) from middles to vanishing points
-        self.sines = self._crossed(points)  # of the angles to these
+        # (K, 3, N) from middles to vanishing points, and sines of the angles to these
+        self.distances = self._distances(points)
+        self.sines = self._crossed(points)
         self.sines /= self.distances
         sigmas = segments.sigmas
         densities = np.empty((len(focals), 4, len(segments)))
@@ -172,7 +171,11 @@ def refined(
     for begin in range(0, len(rotations), NUM_AT_ONCE):
         part = slice(begin, begin + NUM_AT_ONCE)
         best[part], scores[part] = _refined_at_once(
-            segments, rotations[part], focals[part], shifts[part], num_steps
+            segments=segments,
+            rotations=rotations[part],
+            focals=focals[part],
+            shifts=shifts[part],
+            num_steps=num_steps,
         )
     return best, scores
 
@@ -210,7 +213,8 @@ def _turning(rotations: Floats, axis: int) -> Floats:
 def _turned(rotations: Floats, steps: Floats) -> Floats:
     """Turn (K, 3, 3) rows by (K, 3) rotation vectors (Rodrigues)."""
     angles = np.linalg.norm(steps, axis=1)[:, None, None]
-    axes = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
+    axes = steps / np.maximum(lengths, TINY)
     crossed = np.cross(axes[:, None, :], rotations)
     along = (rotations @ axes[:, :, None]) * axes[:, None, :]
     return np.asarray(

@@ -69,7 +69,7 @@ class DepthMaps:
             raise OptionError(
                 f"holds no depth map of any of the {len(names)} images",
                 where=self._path,
-                advice=self._places(names[0]),
+                advice=self._searched_names(names[0]),
             )
 
     def depth(self, photograph: Photograph) -> Singles:
@@ -82,7 +82,7 @@ class DepthMaps:
             raise DepthError(
                 f"no depth map of {photograph.name}",
                 where=self._path,
-                advice=self._places(photograph.name),
+                advice=self._searched_names(photograph.name),
             )
         what = f"{path}: depth map of {photograph.name}"
         try:
@@ -129,7 +129,7 @@ class DepthMaps:
             )
         return depth
 
-    def _places(self, name: str) -> str:
+    def _searched_names(self, name: str) -> str:
         suffixes = ", ".join(SUFFIXES)
         return f"looked for {name}.* and {splitext(name)[0]}.* with * one of {suffixes}"
 

@@ -47,7 +47,9 @@ def segments_of(image: GrayImage, mask: Mask | None = None) -> Segments:
         return Segments.of_image(np.zeros((0, 4)), (width, height))
     ends = found.reshape(-1, 4).astype(np.float64)
     longer_side = max(width, height)
-    lengths = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+    across = ends[:, 2] - ends[:, 0]
+    down = ends[:, 3] - ends[:, 1]
+    lengths = np.hypot(across, down)
     keep = lengths > MIN_LENGTH * longer_side
     keep &= ~_on_frame(ends, lengths, size=(width, height))
     if mask is not None:
@@ -60,19 +62,21 @@ def _on_frame(ends: Floats, lengths: Floats, size: tuple[int, int]) -> Bools:
     margin = BORDER * max(size)
     is_on_frame = np.zeros(len(ends), np.bool_)
     for axis, length in enumerate(size):
-        across = ends[:, [axis, axis + 2]]
-        is_along = np.abs(across[:, 1] - across[:, 0]) < ALONG * lengths
-        is_near = (across.max(axis=1) < margin) | (
-            across.min(axis=1) > length - 1 - margin
-        )
-        is_on_frame |= is_along & is_near
+        starts = ends[:, axis]
+        stops = ends[:, axis + 2]
+        is_along = np.abs(stops - starts) < ALONG * lengths
+        is_near_first = np.maximum(starts, stops) < margin
+        is_near_last = np.minimum(starts, stops) > length - 1 - margin
+        is_on_frame |= is_along & (is_near_first | is_near_last)
     return is_on_frame
 
 
 def _in_mask(ends: Floats, mask: Mask, size: tuple[int, int]) -> Bools:
     """Return which (N, 4) segments have their middle where the mask allows."""
     middles = (ends[:, :2] + ends[:, 2:]) / 2.0
-    scale = np.array([mask.shape[1], mask.shape[0]]) / size
-    places = np.floor(colmap_from_pixel(middles) * scale).astype(np.int64)
-    places = np.clip(places, 0, [mask.shape[1] - 1, mask.shape[0] - 1])
-    return mask[places[:, 1], places[:, 0]]
+    height, width = mask.shape
+    scale = np.array([width, height]) / size
+    pixels = np.floor(colmap_from_pixel(middles) * scale).astype(np.int64)
+    columns = np.clip(pixels[:, 0], 0, width - 1)
+    rows = np.clip(pixels[:, 1], 0, height - 1)
+    return mask[rows, columns]

@@ -48,12 +48,12 @@ def _orientation(file: BinaryIO) -> int:
 
 
 def _change_xmp(data: bytearray, start: int, end: int) -> None:
-    """Change what XMP says between two places of a file, in as many bytes."""
+    """Change what XMP says between two positions in a file, in as many bytes."""
     data[start:end] = XMP_ORIENTATION.sub(rb"\g<1>1", bytes(data[start:end]))
 
 
 def _change_exif(data: bytearray, start: int, end: int) -> None:
-    """Change what EXIF says between two places of a file; it is laid out as a TIFF."""
+    """Change what EXIF says between two positions in a file; it is laid out as a TIFF."""
     block = np.frombuffer(bytes(data[start:end]), np.uint8).copy()
     stand_upright(block)
     data[start:end] = block.tobytes()

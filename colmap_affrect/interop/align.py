@@ -33,9 +33,8 @@ from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.paths import GivenPath, PathLike, as_path
 from colmap_affrect.project.tables import read_table
 
-GEOREFERENCE = (
-    "georeference.json"  # beside a model: what COLMAP's files have no place for
-)
+# Beside a model: what COLMAP's files have no place for
+GEOREFERENCE = "georeference.json"
 # Of known places across the line that fits them best, in units of its length; numeric
 MIN_WIDTH = 0.01
 METRIC = ("x", "y", "z")

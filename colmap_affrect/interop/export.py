@@ -293,10 +293,8 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
             image_path=None,
             is_upright=source.is_upright,
         )
-    except (
-        OptionError,
-        StoreError,
-    ) as error:  # which COLMAP does not say when it writes
+    except (OptionError, StoreError) as error:
+        # COLMAP does not say so when it writes
         raise why_not_written(path / "sparse", error) from error
     with native_writes(path):
         flat.model.export_PLY(path / "points3D.ply")
@@ -413,9 +411,8 @@ FORMATS = {
     "ply": Format(_points, "points3D.ply"),
     "text": Format(_text, "text"),
     "undistorted": Format(_undistorted, DENSE),
-    "nerfstudio": Format(
-        _nerfstudio, DENSE
-    ),  # uses the folder of ``undistorted``, if it is there
+    # Uses the folder of ``undistorted``, if it is there
+    "nerfstudio": Format(_nerfstudio, DENSE),
     "mvsnet": Format(_mvsnet, DENSE),
     "cameras": Format(_cameras, "cameras.csv"),
     "report": Format(_report, "report"),

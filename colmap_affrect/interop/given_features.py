@@ -108,9 +108,8 @@ def require_size(
 
 def keypoint_rows(source: GivenFile, name: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
-    with np.errstate(
-        all="ignore"
-    ):  # what is not finite, or float32 cannot hold, is refused later
+    # What is not finite, or float32 cannot hold, is refused later
+    with np.errstate(all="ignore"):
         points = source.read(f"{name}/keypoints", (None, 2)).astype(np.float32)
         centers = np.asarray(colmap_from_pixel(points))
         count = len(points)

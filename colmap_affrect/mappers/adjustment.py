@@ -116,9 +116,8 @@ class EarlyStop(pyceres.IterationCallback):  # type: ignore[misc]
             self._num_small = 0
         num_left = max(0, self.max_iterations - step.iteration)
         lowest_cost = cost - num_left * change
-        return (
-            lowest_cost >= self.enough * self.other_cost or self._num_small >= NUM_SMALL
-        )
+        stays_above = lowest_cost >= self.enough * self.other_cost
+        return stays_above or self._num_small >= NUM_SMALL
 
 
 class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
@@ -187,9 +186,8 @@ class Adjuster:
     constant: frozenset[int] = frozenset()
     # Ids of the frames whose poses are constant
     constant_frames: frozenset[int] = frozenset()
-    tie_points: TiePoints = (
-        NO_TIE_POINTS  # observed by all models that have two of their images
-    )
+    # Observed by all models that have two of their images
+    tie_points: TiePoints = NO_TIE_POINTS
     # Of models only costs and scores are asked for, which single outliers do not decide
     compares_only: bool = False
 
@@ -242,9 +240,8 @@ class Adjuster:
         images = sorted(registered if image_ids is None else set(image_ids))
         cameras = {model.images[image_id].camera_id for image_id in images}
         others = registered.difference(images)
-        constant = {
-            model.images[image_id].camera_id for image_id in others
-        } | self.constant
+        cameras_of_others = {model.images[image_id].camera_id for image_id in others}
+        constant = cameras_of_others | self.constant
         config = self._config(
             model=model,
             image_ids=images,
@@ -343,9 +340,8 @@ class Adjuster:
             image = model.images[image_id]
             camera = model.cameras[image.camera_id]
             frame = model.frames[image.frame_id]
-            is_reference = frame.rig is None or frame.rig.is_ref_sensor(
-                camera.sensor_id
-            )
+            rig = frame.rig
+            is_reference = rig is None or rig.is_ref_sensor(camera.sensor_id)
             if frame.rig_from_world is None or not is_reference:
                 continue
             blocks = [

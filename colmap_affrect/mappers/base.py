@@ -6,7 +6,7 @@ Entry points of other packages are in the group ``colmap_affrect.mappers``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
@@ -85,12 +85,9 @@ class MappingTask:
     @property
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
-        photographs = self.image_path
-        return (
-            photographs
-            if photographs and photographs.is_dir()
-            else self.database_path.parent
-        )
+        if self.image_path and self.image_path.is_dir():
+            return self.image_path
+        return self.database_path.parent
 
     def refined_intrinsics(self, options: MapperOptions) -> RefinedIntrinsics:
         """Return what is to be refined, of at least one camera."""
@@ -137,6 +134,16 @@ class MappedModel:
     """Pairs that tell that all its images are of one place, where somebody has looked."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
+
+    def first_by(self, hypothesis: str) -> MappedModel:
+        """Return the model with the name of a hypothesis before those that it has."""
+        hypotheses = tuple(dict.fromkeys((hypothesis, *self.hypotheses)))
+        return replace(self, hypotheses=hypotheses)
+
+    def also_by(self, hypothesis: str) -> MappedModel:
+        """Return the model with the name of a hypothesis after those that it has."""
+        hypotheses = tuple(dict.fromkeys((*self.hypotheses, hypothesis)))
+        return replace(self, hypotheses=hypotheses)
 
 
 class Mapper(Protocol):

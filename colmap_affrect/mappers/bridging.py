@@ -32,6 +32,7 @@ from colmap_affrect.mappers.pair_graph import (
     VerifiedPair,
     cameras_of,
     poses_of,
+    used_cameras,
 )
 from colmap_affrect.project.report import Bridge
 
@@ -120,7 +121,7 @@ class BridgeFinder:
         return sorted(found, key=lambda hypothesis: -hypothesis.rank)
 
     def _open_pairs(self, posed: _PosedModel) -> Iterator[_OpenPair]:
-        used = {camera.camera_id: camera for camera in posed.cameras.values()}
+        used = used_cameras(posed.model)
         for pair in self.graph.pairs:
             is_inside = [image_id in posed.poses for image_id in pair.ids]
             if sum(is_inside) == 1:
@@ -175,11 +176,11 @@ class BridgeFinder:
         known = posed.known_depths(image_id)
         keypoints = self.graph.keypoints[image_id]
         positions = keypoints[relative.matches[:, side]].astype(np.float64)
-        own = positions, relative.depths[side]
-        radius = DEPTH_RADIUS * max(camera.width, camera.height)
-        scale = scale_between(known, own, radius)
+        of_pair = positions, relative.depths[side]
+        radius_px = DEPTH_RADIUS * max(camera.width, camera.height)
+        scale = scale_between(known, of_pair, radius_px)
         if not _is_certain(scale):
-            scale = scale_by_planes(known, own, PLANE_RADIUS_FACTOR * radius)
+            scale = scale_by_planes(known, of_pair, PLANE_RADIUS_FACTOR * radius_px)
         return scale if _is_certain(scale) else None
 
     def _agreeing_weight(
@@ -225,8 +226,13 @@ def _chained(known: Pose, relative: Pose, side: int, scale: float) -> Pose:
         side: Which image the known one is, 0 for the first and 1 for the second.
         scale: Length of the relative translation in units of the model.
     """
-    rotation, translation = relative
-    if side == 1:
-        rotation, translation = rotation.T, -rotation.T @ translation
+    other_from_known = relative if side == 0 else _inverse(relative)
+    rotation, translation = other_from_known
     known_rotation, known_translation = known
     return rotation @ known_rotation, rotation @ known_translation + scale * translation
+
+
+def _inverse(pose: Pose) -> Pose:
+    """Return the inverse of a pose."""
+    rotation, translation = pose
+    return rotation.T, -rotation.T @ translation

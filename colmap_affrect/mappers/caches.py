@@ -28,7 +28,12 @@ def empty_copy(
             frame.add_data_id(image.data_id)
             frames[image.frame_id] = frame
     used_rigs = sorted({frame.rig_id for frame in frames.values()})
-    return _filled_cache(cache, used_rigs, frames.values(), images)
+    return _filled_cache(
+        cache=cache,
+        rig_ids=used_rigs,
+        frames=frames.values(),
+        images=images,
+    )
 
 
 def _filled_cache(

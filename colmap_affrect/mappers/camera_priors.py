@@ -130,10 +130,8 @@ class CameraPrior:
         """Return how much a focal length costs, in nats."""
         if not self.sigma:
             return 0.0
-        return (
-            0.5
-            * (math.log(max(focal_px, MIN_FOCAL_PX) / self.focal_px) / self.sigma) ** 2
-        )
+        log_ratio = math.log(max(focal_px, MIN_FOCAL_PX) / self.focal_px)
+        return 0.5 * (log_ratio / self.sigma) ** 2
 
     def cost_of(self, camera: pycolmap.Camera) -> float:
         """Return how much focal length and principal point of a camera cost, in nats."""
@@ -154,15 +152,12 @@ def with_distortion_of(
         priors: By camera id.
         cameras: Of the model.
     """
-    is_straight = {camera.camera_id: camera.is_undistorted() for camera in cameras}
-    return {
-        key: replace(
-            prior,
-            has_distortion=prior.has_prior_focal_length
-            or not is_straight.get(key, False),
-        )
-        for key, prior in priors.items()
-    }
+    undistorted = {camera.camera_id for camera in cameras if camera.is_undistorted()}
+    found = {}
+    for key, prior in priors.items():
+        has_distortion = prior.has_prior_focal_length or key not in undistorted
+        found[key] = replace(prior, has_distortion=has_distortion)
+    return found
 
 
 @dataclass(frozen=True)
@@ -176,7 +171,7 @@ class FocalContradiction:
     lines_sigma: float  # of the logarithm
 
 
-def product(usual: LogNormal, measurements: Iterable[Measurement]) -> LogNormal:
+def combined(usual: LogNormal, measurements: Iterable[Measurement]) -> LogNormal:
     """Combine what is usual with measurements, each of which may be false.
 
     A false measurement says nothing: its likelihood is then what is usual.
@@ -190,11 +185,10 @@ def product(usual: LogNormal, measurements: Iterable[Measurement]) -> LogNormal:
     """
     logs = usual.log_densities(LOG_FOCALS)
     for measured in measurements:
-        right = math.log(1.0 - measured.false_share) + measured.focal.log_densities(
-            LOG_FOCALS
-        )
-        false = math.log(measured.false_share) + USUAL.log_densities(LOG_FOCALS)
-        logs = logs + np.logaddexp(right, false)
+        densities = measured.focal.log_densities(LOG_FOCALS)
+        if_right = math.log(1.0 - measured.false_share) + densities
+        if_false = math.log(measured.false_share) + USUAL.log_densities(LOG_FOCALS)
+        logs = logs + np.logaddexp(if_right, if_false)
     chances = np.exp(logs - logs.max())
     chances /= chances.sum()
     mean = float(chances @ LOG_FOCALS)
@@ -215,6 +209,16 @@ def measurement_of_lines(camera: LineCamera) -> Measurement | None:
     weighted -= math.log(line_model.USUAL_FOCAL) * usual_precision
     focal = LogNormal(math.exp(weighted / precision), precision**-0.5)
     return Measurement(focal, LYING_LINES)
+
+
+def _measurements_of_lines(lines: Iterable[LineCamera]) -> list[Measurement]:
+    """Return what lines of several images say of a focal length, without those that say nothing."""
+    found = list[Measurement]()
+    for camera in lines:
+        measured = measurement_of_lines(camera)
+        if measured:
+            found.append(measured)
+    return found
 
 
 def camera_prior(
@@ -238,11 +242,11 @@ def camera_prior(
     if is_trusted:
         return CameraPrior(focal_px, EXIF_SIGMA)
     longer_px = max(camera.width, camera.height)
-    told = [measured for measured in map(measurement_of_lines, lines) if measured]
+    measurements = _measurements_of_lines(lines)
     usual = USUAL
     if record and record.uncropped_px:
         usual = LogNormal(record.uncropped_px / longer_px, CROP_SIGMA)
-    focal = product(usual, told) if told else usual
+    focal = combined(usual, measurements) if measurements else usual
     focal = LogNormal(focal.focal * longer_px, max(focal.sigma, LINES_SIGMA))
     return CameraPrior(
         focal_px=focal.focal,
@@ -255,9 +259,8 @@ def camera_prior(
 def _starts(focal_px: LogNormal) -> tuple[float, ...]:
     """Return the focal lengths near which models begin, the likeliest first."""
     zooms = ZOOMS if focal_px.sigma > KNOWN_SIGMA else ZOOMS[:1]
-    return tuple(
-        focal_px.focal * zoom ** (focal_px.sigma / USUAL_SIGMA) for zoom in zooms
-    )
+    narrower = focal_px.sigma / USUAL_SIGMA
+    return tuple(focal_px.focal * zoom**narrower for zoom in zooms)
 
 
 def _principal_point(
@@ -271,11 +274,12 @@ def _principal_point(
     if record is None or not has_free_center(camera, record):
         return None
     longer_px = max(camera.width, camera.height)
-    across_sigma = SHIFTED_SIGMA if record.uncropped_px else MIDDLE_SIGMA
+    is_crop = bool(record.uncropped_px)
+    across_sigma = SHIFTED_SIGMA if is_crop else MIDDLE_SIGMA
     down = _shift(lines)
+    if down is None and not is_crop:
+        return shifted_principal_point(camera) if is_off_center(camera) else None
     if down is None:
-        if not record.uncropped_px:
-            return shifted_principal_point(camera) if is_off_center(camera) else None
         down = Normal(0.0, SHIFTED_SIGMA)
     return PrincipalPointPrior(
         (camera.width / 2.0, camera.height / 2.0 + down.mean * longer_px),
@@ -305,18 +309,19 @@ def is_off_center(camera: pycolmap.Camera) -> bool:
 
 def shifted_principal_point(camera: pycolmap.Camera) -> PrincipalPointPrior:
     """Return what is known of the principal point of a print, or of a view camera."""
-    sigma_px = SHIFTED_SIGMA * max(camera.width, camera.height)
-    return PrincipalPointPrior(
-        (camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px)
-    )
+    return _around_middle(camera, SHIFTED_SIGMA)
 
 
 def usual_principal_point(camera: pycolmap.Camera) -> PrincipalPointPrior:
     """Return what is known of the principal point of a whole photograph."""
-    sigma_px = MIDDLE_SIGMA * max(camera.width, camera.height)
-    return PrincipalPointPrior(
-        (camera.width / 2.0, camera.height / 2.0), (sigma_px, sigma_px)
-    )
+    return _around_middle(camera, MIDDLE_SIGMA)
+
+
+def _around_middle(camera: pycolmap.Camera, sigma: float) -> PrincipalPointPrior:
+    """Return the prior of a principal point with a deviation in longer sides."""
+    middle_px = (camera.width / 2.0, camera.height / 2.0)
+    sigma_px = sigma * max(camera.width, camera.height)
+    return PrincipalPointPrior(middle_px, (sigma_px, sigma_px))
 
 
 def _shift(lines: Iterable[LineCamera]) -> Normal | None:
@@ -360,11 +365,19 @@ def camera_priors(
         if camera.camera_id in found:
             continue
         record = records.get(camera.camera_id)
-        of_images = [
-            lines[name] for name in (record.names if record else ()) if name in lines
-        ]
-        found[camera.camera_id] = camera_prior(camera, record, of_images)
+        found[camera.camera_id] = camera_prior(
+            camera, record, _lines_of_images(record, lines)
+        )
     return found
+
+
+def _lines_of_images(
+    record: CameraRecord | None, lines: Mapping[str, LineCamera]
+) -> list[LineCamera]:
+    """Return what the lines of the images of a camera say, of those that have some."""
+    if record is None:
+        return []
+    return [lines[name] for name in record.names if name in lines]
 
 
 def focal_contradictions(
@@ -384,15 +397,10 @@ def focal_contradictions(
         record = records.get(camera.camera_id)
         if record is None or record.source not in TRUSTED:
             continue
-        of_images = [lines[name] for name in record.names if name in lines]
-        told = [
-            measured for measured in map(measurement_of_lines, of_images) if measured
-        ]
-        certain = [replace(measured, false_share=NO_SHARE) for measured in told]
-        by_lines = product(LogNormal(USUAL_FOCAL, WIDE_SIGMA), certain)
-        longer_px = max(camera.width, camera.height)
+        by_lines = _focal_by_lines(_lines_of_images(record, lines))
+        lines_px = by_lines.focal * max(camera.width, camera.height)
         said_px = float(camera.mean_focal_length())
-        difference = math.log(said_px / (by_lines.focal * longer_px))
+        difference = math.log(said_px / lines_px)
         tolerated = MAX_DEVIATIONS * math.hypot(by_lines.sigma, EXIF_SIGMA)
         if by_lines.sigma < KNOWN_SIGMA and abs(difference) > tolerated:
             found.append(
@@ -400,8 +408,16 @@ def focal_contradictions(
                     names=record.names,
                     source=record.source,
                     said_px=said_px,
-                    lines_px=by_lines.focal * longer_px,
+                    lines_px=lines_px,
                     lines_sigma=by_lines.sigma,
                 )
             )
     return found
+
+
+def _focal_by_lines(lines: Iterable[LineCamera]) -> LogNormal:
+    """Return the focal length of a camera, in longer sides, as if no lines could be false."""
+    certain = list[Measurement]()
+    for measured in _measurements_of_lines(lines):
+        certain.append(replace(measured, false_share=NO_SHARE))
+    return combined(LogNormal(USUAL_FOCAL, WIDE_SIGMA), certain)

@@ -123,7 +123,7 @@ class CovarianceProblem:
         return True
 
     def _triangle(self) -> list[Array] | None:
-        """Return the places of three points far from each other, None where there are none."""
+        """Return the positions of three points far from each other, None where there are none."""
         points = self.model.points3D
         ranked = sorted(points, key=lambda key: (-points[key].track.length(), key))
         blocks = list[Array]()

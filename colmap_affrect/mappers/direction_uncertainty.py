@@ -12,6 +12,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.two_views import cross_product_matrix
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.covariance import POSES, CovarianceProblem
 
@@ -49,9 +50,8 @@ def direction_sigmas_deg(
         return {}
     num_needed = math.ceil((len(image_ids) - 1) / 2)
     found = dict[int, float]()
-    for image_id, sigmas_deg in _determined(
-        model, covariance, adjuster.noise_px
-    ).items():
+    determined = _determined(model, covariance, adjuster.noise_px)
+    for image_id, sigmas_deg in determined.items():
         if len(sigmas_deg) >= num_needed:
             found[image_id] = sorted(sigmas_deg)[num_needed - 1]
     return found
@@ -83,12 +83,12 @@ def _direction_sigma_deg(
     variance of one. COLMAP's own covariance of relative poses takes the parameters of a pose for
     those of SE(3); they are half the angles of a rotation, applied last, and the translation.
     """
-    own = covariance.get_cam_cov_from_world(first)
-    others = covariance.get_cam_cov_from_world(second)
-    common = covariance.get_cam_cross_cov_from_world(first, second)
-    if own is None or others is None or common is None:
+    of_first = covariance.get_cam_cov_from_world(first)
+    of_second = covariance.get_cam_cov_from_world(second)
+    cross = covariance.get_cam_cross_cov_from_world(first, second)
+    if of_first is None or of_second is None or cross is None:
         return math.inf
-    joint = np.block([[own, common], [np.transpose(common), others]])
+    joint = np.block([[of_first, cross], [np.transpose(cross), of_second]])
     if not np.isfinite(joint).all():
         return math.inf
     first_pose = model.images[first].cam_from_world()
@@ -99,21 +99,10 @@ def _direction_sigma_deg(
     distance = float(np.linalg.norm(to_second))
     if distance == 0.0:
         return math.inf
-    jacobian = np.hstack(
-        [
-            2.0 * _cross_matrix(carried),
-            np.eye(3),
-            -2.0 * rotation @ _cross_matrix(second_pose.translation),
-            -rotation,
-        ]
-    )
+    by_first_rotation = 2.0 * cross_product_matrix(carried)
+    by_second_rotation = -2.0 * rotation @ cross_product_matrix(second_pose.translation)
+    jacobian = np.hstack([by_first_rotation, np.eye(3), by_second_rotation, -rotation])
     direction = to_second / distance
     across = np.eye(3) - np.outer(direction, direction)
     variance = float(np.trace(across @ jacobian @ joint @ jacobian.T @ across))
     return math.degrees(math.sqrt(max(variance, 0.0)) / distance)
-
-
-def _cross_matrix(vector: Array) -> Array:
-    """Return the (3, 3) matrix that takes a vector to its cross product with (3,) ``vector``."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

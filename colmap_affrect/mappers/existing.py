@@ -249,15 +249,15 @@ def _take_rigs(images: Sequence[_SameImage], new: pycolmap.Reconstruction) -> No
     """
     poses = {image.new.data_id: image.old.cam_from_world() for image in images}
     for image in images:
-        own = image.new.data_id
+        data_id = image.new.data_id
         frame = new.frame(image.new.frame_id)
         rig = new.rig(frame.rig_id)
-        if rig.is_ref_sensor(own.sensor_id):
+        if rig.is_ref_sensor(data_id.sensor_id):
             continue
-        reference = [i for i in frame.data_ids if rig.is_ref_sensor(i.sensor_id)]
-        if reference and reference[0] in poses:
-            sensor_from_rig = poses[own] * poses[reference[0]].inverse()
-            rig.set_sensor_from_rig(own.sensor_id, sensor_from_rig)
+        references = [i for i in frame.data_ids if rig.is_ref_sensor(i.sensor_id)]
+        if references and references[0] in poses:
+            sensor_from_rig = poses[data_id] * poses[references[0]].inverse()
+            rig.set_sensor_from_rig(data_id.sensor_id, sensor_from_rig)
 
 
 def _take_poses(

@@ -64,16 +64,23 @@ def sure_few_matches(
     closures = _Closures({**raw, **verified})
     found = list[FewMatches]()
     for ids, matches in sorted(raw.items()):
-        both = cameras[ids[0]], cameras[ids[1]]
-        keypoints = [_keypoints(database, ids, matches, side) for side in (0, 1)]
-        points = keypoints[0][:, :2], keypoints[1][:, :2]
+        first, second = ids
+        both = cameras[first], cameras[second]
+        points1 = _positions(database, first, matches[:, 0])
+        points2 = _positions(database, second, matches[:, 1])
+        points = points1, points2
         geometry = _geometry(both, points, options)
         if geometry is None:
             continue
         inliers = matches[np.asarray(geometry.inlier_matches, np.int64)[:, 0]]
         if len(inliers) < MIN_INLIER_SHARE * len(matches):
             continue
-        of_chance = significance(geometry, both, points, options.max_error_px)
+        of_chance = significance(
+            geometry=geometry,
+            cameras=both,
+            keypoints=points,
+            max_error_px=options.max_error_px,
+        )
         evidence = max(of_chance, 0.0) + closures.log10_evidence(ids, inliers)
         if evidence >= options.min_significance:
             found.append(FewMatches(ids, inliers, geometry))
@@ -171,16 +178,15 @@ class _Closures:
         return by_chance - log10_choose(num_chained, num_agreeing)
 
 
-def _keypoints(
-    database: pycolmap.Database, ids: Ids, matches: Indices, side: int
+def _positions(
+    database: pycolmap.Database, image_id: int, features: Indices
 ) -> Singles:
-    """Return the (M, 2, 4 or 6) keypoints of matches of a pair.
+    """Return the (M, 2) positions of features of an image.
 
     Args:
         database: Has the keypoints.
-        ids: Of the pair.
-        matches: (M, 2) features.
-        side: Of the first image 0, of the second one 1.
+        image_id: Of the image.
+        features: (M,) numbers of keypoints.
     """
-    rows = np.asarray(database.read_keypoints(ids[side]), np.float32)
-    return rows[matches[:, side]]
+    keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
+    return keypoints[features, :2]

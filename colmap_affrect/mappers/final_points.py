@@ -90,11 +90,10 @@ def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
     for point_id, point in model.points3D.items():
         if point.error * point.track.length() <= max_error_px:  # the sum: none is above
             continue
-        errors = [
-            _observation_error_px(model, point, element)
-            for element in point.track.elements
-        ]
-        num_within = sum(error <= max_error_px for error in errors)
+        num_within = 0
+        for element in point.track.elements:
+            error_px = _observation_error_px(model, point, element)
+            num_within += error_px <= max_error_px
         if num_within < 2:
             found.add(point_id)
     return found
@@ -153,9 +152,8 @@ def _refine(
     solver.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
     pyceres.solve(solver, problem, pyceres.SolverSummary())
     for pose, known in zip(poses, before, strict=True):
-        pose[:] = (
-            known  # COLMAP makes quaternions of length 1 again, which may change a last bit
-        )
+        # COLMAP normalises quaternions, which may change a last bit.
+        pose[:] = known
 
 
 def _pose_parameters(model: pycolmap.Reconstruction) -> list[Array]:

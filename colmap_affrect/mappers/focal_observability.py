@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import (
@@ -23,7 +24,7 @@ from colmap_affrect.mappers.focal_uncertainty import (
     focal_sigmas,
 )
 from colmap_affrect.mappers.model_score import num_occupied_cells
-from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs, sampling_step
+from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 FACTORS = 1.25, 0.8
@@ -133,9 +134,8 @@ class _FocalTrials:
         for keys in np.array_split(camera_ids, min(len(camera_ids), MAX_NUM_TRIALS)):
             groups.append(keys.tolist())
         found: dict[int, float] = {}
-        for keys, growth in zip(
-            groups, map_ordered(self.growth, groups, available_cores()), strict=True
-        ):
+        growths = map_ordered(self.growth, groups, available_cores())
+        for keys, growth in zip(groups, growths, strict=True):
             found.update(dict.fromkeys(keys, growth))
         return found
 
@@ -205,32 +205,55 @@ def fitting_focals(
     given = {key for key in recorded if "focal" in task.cameras[key].given}
     if not given or not _is_tried(model):
         return {}
-    free_priors = {**priors}
-    for key in given:
-        free_priors[key] = replace(priors[key], sigma=FREE_SIGMA)
     # A wrong focal length is made up for by distortion, where that was free.
     constant = frozenset(key for key in given if task.cameras[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
-    given_model = with_fewer_points(model)
-    given_cost = Adjuster(
+    given_adjuster = Adjuster(
         priors=priors, noise_px=NOISE_PX, refining=refining, constant=constant
-    ).adjust(given_model, FINAL)
-    num = num_independent(given_model)
-    per_parameter = 0.5 * math.log(max(2, num))
-    weight = num / max(1, given_model.compute_num_observations())
-    free = Adjuster(priors=free_priors, noise_px=NOISE_PX, refining=refining)
+    )
+    given_model = with_fewer_points(model)
+    given_cost = given_adjuster.adjust(given_model, FINAL)
+    free_adjuster = Adjuster(
+        priors=_with_free_focals(priors, given), noise_px=NOISE_PX, refining=refining
+    )
     free_model = with_fewer_points(model)
-    gain = given_cost - free.adjust(free_model, FINAL)
-    if gain * weight >= len(given) * per_parameter:
+    gain = given_cost - free_adjuster.adjust(free_model, FINAL)
+    if _is_worth_parameters(gain, len(given), given_model):
         return _moved_focals(free_model, priors, given)
     if len(given) == 1:
         return {}
-    # What is wrong in the same way everywhere is one parameter.
     common_model = with_fewer_points(model)
-    gain = given_cost - adjust_common_factor(common_model, free, sorted(given))
-    if gain * weight >= per_parameter:
+    common_cost = adjust_common_factor(common_model, free_adjuster, sorted(given))
+    # What is wrong in the same way everywhere is one parameter.
+    if _is_worth_parameters(given_cost - common_cost, 1, given_model):
         return _moved_focals(common_model, priors, given)
     return {}
+
+
+def _with_free_focals(
+    priors: Mapping[int, CameraPrior], camera_ids: Collection[int]
+) -> dict[int, CameraPrior]:
+    """Return priors, of which those of some cameras hardly restrict the focal length."""
+    found = dict(priors)
+    for key in camera_ids:
+        found[key] = replace(priors[key], sigma=FREE_SIGMA)
+    return found
+
+
+def _is_worth_parameters(
+    gain: float, num_parameters: int, model: pycolmap.Reconstruction
+) -> bool:
+    """Tell whether free parameters lower a cost by as much as they are worth (BIC).
+
+    Args:
+        gain: By what the cost is lower, which is a sum over all observations.
+        num_parameters: How many are free.
+        model: Has the observations, of which those in one cell of an image count once.
+    """
+    num_cells = num_independent(model)
+    worth = 0.5 * math.log(max(2, num_cells)) * num_parameters
+    counted_share = num_cells / max(1, model.compute_num_observations())
+    return gain * counted_share >= worth
 
 
 def _moved_focals(
@@ -286,8 +309,9 @@ def _is_tried(model: pycolmap.Reconstruction) -> bool:
 
 def num_independent(model: pycolmap.Reconstruction) -> int:
     """Return how many cells of all images hold observations, which err together in a cell."""
-    num = 0
+    num_cells = 0
     for image_id, camera in cameras_of(model).items():
-        seen = [p.xy for p in model.images[image_id].get_observation_points2D()]
-        num += num_occupied_cells(camera, np.array(seen).reshape(-1, 2))
-    return num
+        observations = model.images[image_id].get_observation_points2D()
+        points_px = np.array([point.xy for point in observations]).reshape(-1, 2)
+        num_cells += num_occupied_cells(camera, points_px)
+    return num_cells

@@ -156,11 +156,10 @@ class GlobalMapper:
         constant = task.constant_cameras(self.options) & set(model.cameras)
         if not constant:
             return
+        given = {}
         with open_database(task.database_path) as database:
-            given = {
-                c.camera_id: c.params.tolist()
-                for c in cameras_of_images(database).values()
-            }
+            for camera in cameras_of_images(database).values():
+                given[camera.camera_id] = camera.params.tolist()
         has_changed = False
         for key in constant:
             camera = model.cameras[key]
@@ -169,9 +168,10 @@ class GlobalMapper:
                 has_changed = True
         if has_changed:
             priors = camera_priors(model.cameras.values(), task.cameras, task.lines)
-            Adjuster(
+            adjuster = Adjuster(
                 priors=priors,
                 noise_px=NOISE_PX,
                 refining=options,
                 constant=frozenset(constant),
-            ).adjust(model, FINAL)
+            )
+            adjuster.adjust(model, FINAL)

@@ -31,16 +31,15 @@ def with_other_groups(
         Also models of groups of three photographs and more, each of pairs inside of its group.
     """
     found = list(models)
-    tried = set[int]()
-    group = _largest_group(search.graph, found, tried)
+    mapped_groups = set[int]()
+    group = _largest_group(search.graph, found, mapped_groups)
     while group:
-        tried |= group
-        outside = [
-            pair.ids for pair in search.graph.verified if not group >= {*pair.ids}
-        ]
-        own = search.best(search.graph.without(outside))
-        found += [mapped for mapped in own if _num_images(mapped) >= MIN_GROUP]
-        group = _largest_group(search.graph, found, tried)
+        mapped_groups |= group
+        models_of_group = search.best(_inside(search.graph, group))
+        for mapped in models_of_group:
+            if _num_images(mapped) >= MIN_GROUP:
+                found.append(mapped)
+        group = _largest_group(search.graph, found, mapped_groups)
     return found
 
 
@@ -95,12 +94,12 @@ def _largest_place_alone(
     Returns:
         The model; None where there is one place alone, or most of its photographs are in no model.
     """
-    own = places.images[0] - places.collages
-    if len(places.images) < 2 or len(own) < MIN_PLACE:
+    largest = places.images[0] - places.collages
+    if len(places.images) < 2 or len(largest) < MIN_PLACE:
         return None
-    made = map_again(_inside(graph, own))
-    is_good = made and 2 * _num_images(made[0]) > len(own)
-    return made[0] if is_good else None
+    made = map_again(_inside(graph, largest))
+    has_most = made and 2 * _num_images(made[0]) > len(largest)
+    return made[0] if has_most else None
 
 
 def _inside(graph: PairGraph, image_ids: Set[int]) -> PairGraph:
@@ -122,8 +121,8 @@ def _why_apart(places: Places, graph: PairGraph) -> dict[str, Doubt]:
 def _with_why_apart(mapped: MappedModel, why_apart: Mapping[str, Doubt]) -> MappedModel:
     """Return a model with the reasons of the images that it does not have."""
     model = mapped.reconstruction
-    own = {model.images[image_id].name for image_id in model.reg_image_ids()}
-    others = {name: why for name, why in why_apart.items() if name not in own}
+    inside = {model.images[image_id].name for image_id in model.reg_image_ids()}
+    others = {name: why for name, why in why_apart.items() if name not in inside}
     return replace(mapped, apart=others)
 
 
@@ -132,19 +131,19 @@ def _num_images(mapped: MappedModel) -> int:
 
 
 def _largest_group(
-    graph: PairGraph, models: Sequence[MappedModel], tried: set[int]
+    graph: PairGraph, models: Sequence[MappedModel], mapped_groups: set[int]
 ) -> set[int]:
-    """Return the largest group that pairs connect, without images of models or tried ones.
+    """Return the largest group that pairs connect, without images of models or mapped groups.
 
     Args:
         graph: The pairs.
         models: Their images are in no group.
-        tried: Nor are these.
+        mapped_groups: Nor are these images.
 
     Returns:
         The images; none where no group has enough of them.
     """
-    inside = set(tried)
+    inside = set(mapped_groups)
     for mapped in models:
         inside.update(mapped.reconstruction.reg_image_ids())
     outside = [pair.ids for pair in graph.pairs if inside.isdisjoint(pair.ids)]

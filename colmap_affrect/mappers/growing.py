@@ -92,15 +92,15 @@ class Grower:
             self._triangulate(mapper, pair)
             self._adjust(mapper, FAST)
             self.show(len(pair))
-            has_few_matches = not self.graph.images_with_few_matches_only.isdisjoint(
-                pair
-            )
-            if model.num_points3D() < (
-                MIN_FEW_POINTS if has_few_matches else MIN_POINTS
-            ):
+            if model.num_points3D() < self._min_num_points(pair):
                 return None
             self._complete(mapper)
         return model
+
+    def _min_num_points(self, pair: tuple[int, int]) -> int:
+        """Return how many points a first pair must make."""
+        with_few = self.graph.images_with_few_matches_only
+        return MIN_POINTS if with_few.isdisjoint(pair) else MIN_FEW_POINTS
 
     def _options_of_first(self) -> pycolmap.IncrementalMapperOptions:
         """Return the options for a first pair; where no pair has many inliers, fewer are enough."""
@@ -114,18 +114,14 @@ class Grower:
         self, model: pycolmap.Reconstruction, ids: tuple[int, int]
     ) -> pycolmap.Rigid3d | None:
         """Return cam2_from_cam1 of a pair with few matches: COLMAP begins with no such pair."""
-        few = [
-            pair
-            for pair in self.graph.pairs
-            if pair.ids == ids and pair.has_few_matches
-        ]
-        if not few:
+        pair = next((pair for pair in self.graph.pairs if pair.ids == ids), None)
+        if pair is None or not pair.has_few_matches:
             return None
         cameras = {i: model.cameras[model.images[i].camera_id] for i in ids}
-        poses = self.graph.relative_poses(few[0], cameras, self.native.random_seed)
-        if not poses:
+        found = self.graph.relative_poses(pair, cameras, self.native.random_seed)
+        if not found:
             return None
-        return pycolmap.Rigid3d(np.column_stack(poses[0].pose))
+        return pycolmap.Rigid3d(np.column_stack(found[0].pose))
 
     def adjust_fully(
         self, model: pycolmap.Reconstruction, max_iterations: int = FINAL
@@ -187,9 +183,8 @@ class Grower:
             if image.has_pose or image.frame is None:
                 continue
             if image.camera_id not in used:
-                model.cameras[image.camera_id].params = cameras[
-                    image_id
-                ].params.tolist()
+                params = cameras[image_id].params.tolist()
+                model.cameras[image.camera_id].params = params
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
             model.register_frame(image.frame_id)
@@ -209,10 +204,8 @@ class Grower:
             mapper.complete_and_merge_tracks(self.triangulation)
             num_images = model.num_reg_images()
             self.show(num_images)
-            is_global = (
-                num_images <= NUM_ALWAYS_ADJUSTED or num_images >= GROWTH * num_adjusted
-            )
-            if is_global:
+            is_small = num_images <= NUM_ALWAYS_ADJUSTED
+            if is_small or num_images >= GROWTH * num_adjusted:
                 self._adjust(mapper, FAST)
                 num_adjusted = num_images
             else:

@@ -27,6 +27,7 @@ from colmap_affrect.mappers.pair_graph import (
     cameras_of,
     num_matched_images,
     poses_of,
+    used_cameras,
 )
 
 
@@ -68,9 +69,10 @@ class ModelScorer:
             num = self.num_cells(pair)
             num_agreeing = self.graph.agreement(pair, poses, cameras) * num
             total += pair_log_ratio(num_agreeing, num)
-        used = {camera.camera_id: camera for camera in cameras.values()}
-        costs = [self.priors[key].cost_of(camera) for key, camera in used.items()]
-        return total - sum(costs)
+        cost = 0.0
+        for key, camera in used_cameras(model).items():
+            cost += self.priors[key].cost_of(camera)
+        return total - cost
 
     def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether tracks of three images confirm each image of a model."""
@@ -97,9 +99,7 @@ class ModelScorer:
         """
         viewpoint_of = viewpoint_of or {}
         num_partners = self._num_partners(model, viewpoint_of)
-        points = {
-            image_id: seen_points(model.images[image_id]) for image_id in num_partners
-        }
+        points = {i: seen_points(model.images[i]) for i in num_partners}
         long_tracks = _seen_by_three(points, viewpoint_of)
         log_ratios = {}
         for image_id, number in num_partners.items():
@@ -114,11 +114,11 @@ class ModelScorer:
     def num_cells(self, pair: VerifiedPair) -> int:
         """Return how many cells hold inliers, in that image of a pair which has fewer."""
         if pair.ids not in self._num_cells:
-            both = zip(pair.ids, self.graph.points(pair), strict=True)
-            counts = [
-                num_occupied_cells(self.graph.cameras[i], points) for i, points in both
-            ]
-            self._num_cells[pair.ids] = min(counts)
+            first, second = pair.ids
+            points1, points2 = self.graph.points(pair)
+            num_cells1 = num_occupied_cells(self.graph.cameras[first], points1)
+            num_cells2 = num_occupied_cells(self.graph.cameras[second], points2)
+            self._num_cells[pair.ids] = min(num_cells1, num_cells2)
         return self._num_cells[pair.ids]
 
     def _num_partners(
@@ -153,8 +153,9 @@ def pair_log_ratio(num_agreeing: float, num: float) -> float:
     >>> pair_log_ratio(30, 30) > pair_log_ratio(10, 10) > 0 > pair_log_ratio(5, 30) > -3.1
     True
     """
-    ratio = _log_ratio(num_agreeing, num, RIGHT_PAIR)
-    return float(np.logaddexp(math.log(1.0 - WRONG_PAIR) + ratio, math.log(WRONG_PAIR)))
+    if_sound = math.log(1.0 - WRONG_PAIR) + _log_ratio(num_agreeing, num, RIGHT_PAIR)
+    if_wrong = math.log(WRONG_PAIR)
+    return float(np.logaddexp(if_sound, if_wrong))
 
 
 def _seen_by_three(
@@ -175,8 +176,11 @@ def _seen_by_three(
             seen.append(np.unique(ids))  # a point may have two keypoints of an image
     for of_images in seen_from.values():
         seen.append(np.unique(np.concatenate(of_images)))
-    ids, num_viewpoints = np.unique(np.concatenate([*seen, [-1]]), return_counts=True)
-    return np.asarray(ids[(num_viewpoints > 2) & (ids >= 0)])
+    none_seen = [-1]
+    all_seen = np.concatenate([*seen, none_seen])
+    ids, num_viewpoints = np.unique(all_seen, return_counts=True)
+    is_point = ids >= 0
+    return np.asarray(ids[is_point & (num_viewpoints > 2)])
 
 
 def _log_ratio(num_agreeing: float, num: float, right: Beta) -> float:

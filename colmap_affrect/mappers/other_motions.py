@@ -21,7 +21,7 @@ from colmap_affrect.colmap.verification import (
     num_consistent_keypoints,
 )
 from colmap_affrect.geometry.arrays import Array, Indices
-from colmap_affrect.mappers.model_score import GRID
+from colmap_affrect.mappers.model_score import GRID, grid_cells
 from colmap_affrect.mappers.pair_graph import (
     CameraById,
     PairGraph,
@@ -30,6 +30,7 @@ from colmap_affrect.mappers.pair_graph import (
     cameras_of,
     compared_with_pose,
     poses_of,
+    strongest_of_images,
 )
 
 NUM_PAIRS = 6  # the strongest of each image that are looked at; resource
@@ -95,7 +96,8 @@ def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
         Of the cells of the pairs that show another motion; 1 where too few of the pairs do.
     """
     poses = poses_of(model)
-    pairs = _strongest(graph.pairs_inside(poses))
+    strongest = strongest_of_images(graph.pairs_inside(poses), NUM_PAIRS)
+    pairs = strongest[:MAX_NUM_PAIRS]
     cameras = cameras_of(model)
     found = list[_Motions]()
     for pair in pairs:
@@ -120,17 +122,6 @@ def _num_pairs_of_features(found: Collection[_Motions]) -> Features:
         for image_id, features in zip(motions.pair.ids, motions.other.T, strict=True):
             num_pairs.update((image_id, feature) for feature in features.tolist())
     return num_pairs
-
-
-def _strongest(pairs: Collection[VerifiedPair]) -> list[VerifiedPair]:
-    """Return the pairs that are among the strongest of one of their images."""
-    counts: Counter[int] = Counter()
-    found = list[VerifiedPair]()
-    for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
-        if min(counts[image_id] for image_id in pair.ids) < NUM_PAIRS:
-            found.append(pair)
-        counts.update(pair.ids)
-    return found[:MAX_NUM_PAIRS]
 
 
 def _motions_of_pair(
@@ -165,12 +156,16 @@ def _motions_of_pair(
         return None
     far = matches[is_far]
     # No motion has more cells than all of the matches that contradict the model.
-    at_most = _Motions(pair, sides, matches[agrees], far)
+    at_most = _Motions(
+        pair=pair,
+        sides=sides,
+        own=matches[agrees],
+        other=far,
+    )
     if at_most.cells()[1] < MIN_CELLS:
         return None
-    num_consistent = num_consistent_keypoints(
-        (keypoints1[far[:, 0]], keypoints2[far[:, 1]])
-    )
+    matched = keypoints1[far[:, 0]], keypoints2[far[:, 1]]
+    num_consistent = num_consistent_keypoints(matched)
     if num_consistent is not None and num_consistent < options.min_num_inliers:
         return None  # the matches of a surface agree with those beside them
     geometry = estimate_geometry(sides, far, options)
@@ -180,7 +175,5 @@ def _motions_of_pair(
 
 def _in_cells(side: Side, features: Indices) -> Array:
     """Return how many of some features of an image are in each cell of a grid."""
-    size = np.array([side.camera.width, side.camera.height])
-    cells = (side.keypoints[features, :2] / size * GRID).astype(int)
-    numbers = np.clip(cells, 0, GRID - 1) @ [1, GRID]
-    return np.bincount(numbers, minlength=GRID * GRID).astype(np.float64)
+    cells = grid_cells(side.camera, side.keypoints[features, :2])
+    return np.bincount(cells, minlength=GRID * GRID).astype(np.float64)

@@ -1,7 +1,6 @@
 """The verified pairs of a database, and how well poses agree with them."""
 
 import copy
-import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,14 +13,18 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.connections import connected_parts
-from colmap_affrect.colmap.database import cameras_of_images, open_database
+from colmap_affrect.colmap.database import (
+    cameras_of_images,
+    names_of_images,
+    open_database,
+)
 from colmap_affrect.colmap.model_files import Pose, relative_pose
 from colmap_affrect.colmap.two_views import (
     Cameras,
     decomposed_homography,
     homography_matrix,
 )
-from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles, sampling_step
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.parallax import Size
 from colmap_affrect.geometry.two_views import (
@@ -75,9 +78,8 @@ class RelativePose:
     """A relative pose of a pair that its inliers allow."""
 
     pose: Pose  # cam2_from_cam1, with a translation of length 1
-    matches: (
-        Indices  # (M, 2) features that agree, with enough parallax to know their depth
-    )
+    matches: Indices
+    """(M, 2) features that agree, with enough parallax to know their depth."""
     depths: tuple[Array, Array]  # of these in both cameras, twice (M,), all positive
 
 
@@ -85,9 +87,8 @@ class RelativePose:
 class Agreement:
     """How well matches agree with a relative pose."""
 
-    errors_px: (
-        Array  # (M,) Sampson errors, infinite where no point in front explains a match
-    )
+    errors_px: Array
+    """(M,) Sampson errors, infinite where no point in front explains a match."""
     tolerance_px: float  # largest error of a match that agrees
     depths: Depths  # of all matches
 
@@ -140,12 +141,12 @@ class PairGraph:
             for pair in graph.pairs:
                 raw = np.asarray(database.read_matches(*pair.ids), np.int64)
                 graph.raw_matches[pair.ids] = raw.reshape(-1, 2)
-            enough = {pair.ids: pair.matches for pair in graph.verified}
             for image_id in graph.keypoints:
                 rows = database.read_keypoints(image_id)
                 graph.shaped_keypoints[image_id] = np.asarray(rows, np.float32)
-            few = sure_few_matches(database, enough)
-            return graph._with_few_matches(few, database) if few else graph
+            known = {pair.ids: pair.matches for pair in graph.verified}
+            found = sure_few_matches(database, known)
+            return graph._with_few_matches(found, database) if found else graph
 
     @classmethod
     def of(
@@ -155,38 +156,45 @@ class PairGraph:
         options = pycolmap.DatabaseCacheOptions(
             min_num_matches=min_num_matches, load_all_images=True
         )
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        cameras = cameras_of_images(database)
         verified = _read_pairs(database, min_num_matches)
-        cache = pycolmap.DatabaseCache.create(database, options)
         keypoints = {}
         for image_id in _images_of(verified):
-            rows = database.read_keypoints(image_id)
-            keypoints[image_id] = np.array(rows[:, :2], np.float32)
-        strong, weak = _strongest(verified)
-        return cls(cache, names, cameras, keypoints, strong, weak, min_num_matches)
+            keypoints[image_id] = _read_positions(database, image_id)
+        strong, weak = _split_by_strength(verified)
+        return cls(
+            cache=pycolmap.DatabaseCache.create(database, options),
+            names=names_of_images(database),
+            cameras=cameras_of_images(database),
+            keypoints=keypoints,
+            pairs=strong,
+            weak=weak,
+            min_num_matches=min_num_matches,
+        )
 
     def without(self, ids: Collection[Ids]) -> Self:
         """Return a graph without some pairs; the same one where there are none."""
         if not ids:
             return self
         kept = [pair for pair in self.verified if pair.ids not in ids]
-        return self._with(kept, self.cache)
+        return self._with_pairs(kept, self.cache)
 
     def _with_few_matches(
-        self, few: Iterable[FewMatches], database: pycolmap.Database
+        self, pairs: Iterable[FewMatches], database: pycolmap.Database
     ) -> Self:
         """Return a graph with more pairs, of few matches, whose keypoints a database has."""
         verified = [*self.verified]
         keypoints = {**self.keypoints}
-        for one in few:
-            for image_id in one.ids:
+        for pair in pairs:
+            for image_id in pair.ids:
                 if image_id not in keypoints:
-                    rows = database.read_keypoints(image_id)
-                    keypoints[image_id] = np.array(rows[:, :2], np.float32)
-            pair = VerifiedPair(one.ids, one.matches, one.geometry, True)
-            verified.append(pair)
-        return replace(self, keypoints=keypoints)._with(verified, self.cache)
+                    keypoints[image_id] = _read_positions(database, image_id)
+            verified.append(
+                VerifiedPair(
+                    pair.ids, pair.matches, pair.geometry, has_few_matches=True
+                )
+            )
+        with_keypoints = replace(self, keypoints=keypoints)
+        return with_keypoints._with_pairs(verified, self.cache)
 
     @cached_property
     def images_with_few_matches_only(self) -> frozenset[int]:
@@ -222,7 +230,7 @@ class PairGraph:
         cameras = {**self.cameras}
         for image_id, image in cache.images.items():
             cameras[image_id] = cache.cameras[image.camera_id]
-        return replace(self._with(self.verified, cache), cameras=cameras)
+        return replace(self._with_pairs(self.verified, cache), cameras=cameras)
 
     def thinned(self) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
@@ -239,9 +247,9 @@ class PairGraph:
         thin = list[VerifiedPair]()
         for pair, kept in zip(self.verified, kept_matches, strict=True):
             thin.append(replace(pair, matches=pair.matches[kept]))
-        return self._with(thin, self.cache)
+        return self._with_pairs(thin, self.cache)
 
-    def _with(
+    def _with_pairs(
         self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache
     ) -> Self:
         """Return a graph of other pairs, with the cameras and images of a cache."""
@@ -258,7 +266,7 @@ class PairGraph:
         new.correspondence_graph.finalize()
         used = _images_of(kept)
         keypoints = {i: points for i, points in self.keypoints.items() if i in used}
-        strong, weak = _strongest(kept)
+        strong, weak = _split_by_strength(kept)
         return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
 
     def points(self, pair: VerifiedPair) -> tuple[Array, Array]:
@@ -302,19 +310,21 @@ class PairGraph:
         if known and known.pair is pair and known.asked == asked:
             return known.share
         pose = relative_pose(poses[first], poses[second])
-        share = float(
-            compared_with_pose(pose, both, self._sampled_points(pair)).agrees.mean()
-        )
+        compared = compared_with_pose(pose, both, self._sampled_points(pair))
+        share = float(compared.agrees.mean())
         self._agreements[pair.ids] = _KnownAgreement(pair, asked, share)
         return share
 
     def unexplained_by(self, model: pycolmap.Reconstruction) -> list[VerifiedPair]:
         """Return the pairs that contradict a model, or have an image that it has not."""
         inside = set(model.reg_image_ids())
-        against = self.contradicted(model)
-        return [
-            p for p in self.pairs if p.ids in against or not inside.issuperset(p.ids)
-        ]
+        contradicted = self.contradicted(model)
+        found = list[VerifiedPair]()
+        for pair in self.pairs:
+            is_inside = inside.issuperset(pair.ids)
+            if not is_inside or pair.ids in contradicted:
+                found.append(pair)
+        return found
 
     def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
         """Return the pairs most of whose inliers disagree with a model that has both images."""
@@ -352,11 +362,13 @@ class PairGraph:
         both = cameras[pair.ids[0]], cameras[pair.ids[1]]
         allowed = list[RelativePose]()
         for pose in self._candidate_poses(pair, both, random_seed):
-            found = compared_with_pose(pose, both, self.points(pair))
-            has_depth = found.agrees & (found.depths.angles_deg > MIN_ANGLE_DEG)
-            if found.agrees.mean() >= MIN_SHARE and has_depth.any():
-                depths = found.depths.first[has_depth], found.depths.second[has_depth]
-                allowed.append(RelativePose(pose, pair.matches[has_depth], depths))
+            compared = compared_with_pose(pose, both, self.points(pair))
+            depths = compared.depths
+            has_depth = compared.agrees & (depths.angles_deg > MIN_ANGLE_DEG)
+            if compared.agrees.mean() >= MIN_SHARE and has_depth.any():
+                matches = pair.matches[has_depth]
+                of_both = depths.first[has_depth], depths.second[has_depth]
+                allowed.append(RelativePose(pose, matches, depths=of_both))
         return allowed
 
     def _candidate_poses(
@@ -456,11 +468,6 @@ def _bytes_of(arrays: Iterable[Array], cameras: Cameras) -> bytes:
     return b"".join(parts)
 
 
-def sampling_step(num_items: int, max_num: int) -> int:
-    """Return the step with which at most so many items are taken, 1 where there are no more."""
-    return max(1, math.ceil(num_items / max_num))
-
-
 def compared_with_pose(
     pose: Pose, cameras: Cameras, points: tuple[Array, Array]
 ) -> Agreement:
@@ -513,15 +520,34 @@ def _images_of(pairs: Iterable[VerifiedPair]) -> set[int]:
     return {image_id for pair in pairs for image_id in pair.ids}
 
 
-def _strongest(pairs: Iterable[VerifiedPair]) -> tuple[Pairs, Pairs]:
-    """Return the pairs among the ``MAX_PAIRS_OF_IMAGE`` strongest of one image, and the others."""
-    counts: Counter[int] = Counter()
-    strong: list[VerifiedPair] = []
-    weak: list[VerifiedPair] = []
-    for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
-        if min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE:
-            strong.append(pair)
-        else:
-            weak.append(pair)
-        counts.update(pair.ids)
-    return tuple(sorted(strong, key=lambda pair: pair.ids)), tuple(weak)
+def _by_strength(pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
+    """Return pairs, those with most inliers first."""
+    return sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids))
+
+
+def strongest_of_images(
+    pairs: Iterable[VerifiedPair], max_num: int
+) -> list[VerifiedPair]:
+    """Return the pairs that are among so many strongest of one of their images, strongest first."""
+    num_stronger = Counter[int]()
+    found = list[VerifiedPair]()
+    for pair in _by_strength(pairs):
+        if min(num_stronger[image_id] for image_id in pair.ids) < max_num:
+            found.append(pair)
+        num_stronger.update(pair.ids)
+    return found
+
+
+def _split_by_strength(pairs: Collection[VerifiedPair]) -> tuple[Pairs, Pairs]:
+    """Return the ``MAX_PAIRS_OF_IMAGE`` strongest pairs of each image, by ids, and the others."""
+    strong = strongest_of_images(pairs, MAX_PAIRS_OF_IMAGE)
+    strong.sort(key=lambda pair: pair.ids)
+    ids_of_strong = {pair.ids for pair in strong}
+    weak = [pair for pair in _by_strength(pairs) if pair.ids not in ids_of_strong]
+    return tuple(strong), tuple(weak)
+
+
+def _read_positions(database: pycolmap.Database, image_id: int) -> Singles:
+    """Return the (N, 2) positions of the keypoints of an image."""
+    rows = database.read_keypoints(image_id)
+    return np.array(rows[:, :2], np.float32)

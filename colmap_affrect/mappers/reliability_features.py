@@ -12,6 +12,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.connections import connected_parts, lone_ties
 from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
@@ -28,7 +29,7 @@ from colmap_affrect.mappers.pair_graph import (
     cameras_of,
     graph_of,
     poses_of,
-    sampling_step,
+    used_cameras,
 )
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs, viewpoints
 from colmap_affrect.mappers.tie_points import (
@@ -65,14 +66,12 @@ class ReliabilityFeatures:
     focal_growth: float
     """Part by which the cost of adjustment grows with another focal length; 1 of a known one."""
     focal_px: float  # of its camera
-    fitting_focal_px: (
-        float  # what fits, where the focal length that the user gave does not; else 0
-    )
+    fitting_focal_px: float
+    """What fits, where the focal length that the user gave does not; else 0."""
     pure_rotation_ratio: float
     """Share of the matches without parallax, of the strongest pairs of its frame with others."""
-    mirrored_original: (
-        str  # name of the photograph that it may be a mirrored copy of, or empty
-    )
+    mirrored_original: str
+    """Name of the photograph that it may be a mirrored copy of, or empty."""
     focal_spread: float
     """Longest by shortest focal length of the photographs of its size, of those that only the model
     tells: parts of photographs have longer ones, and their middle is elsewhere."""
@@ -96,20 +95,19 @@ class _ModelContext:
         self.graph = graph_of(task, MIN_NUM_MATCHES)
         self.poses = poses_of(self.model)
         self.cameras = cameras_of(self.model)
-        used = {camera.camera_id: camera for camera in self.cameras.values()}
-        self.used_cameras = used
-        priors = camera_priors(used.values(), task.cameras, task.lines)
-        self.priors = with_distortion_of(priors, used.values())
+        self.used_cameras = used_cameras(self.model)
+        used = self.used_cameras.values()
+        priors = camera_priors(used, task.cameras, task.lines)
+        self.priors = with_distortion_of(priors, used)
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
         self.agreements: dict[Ids, float] = {}
-        self.pairs_of: dict[int, list[VerifiedPair]] = {
-            i: [] for i in sorted(self.poses)
-        }
+        self.pairs_of: dict[int, list[VerifiedPair]] = {}
+        for image_id in sorted(self.poses):
+            self.pairs_of[image_id] = []
         for pair in self.pairs:
-            self.agreements[pair.ids] = self.graph.agreement(
-                pair, self.poses, self.cameras
-            )
+            agreement = self.graph.agreement(pair, self.poses, self.cameras)
+            self.agreements[pair.ids] = agreement
             for image_id in pair.ids:
                 self.pairs_of[image_id].append(pair)
         self.pairs_of_frames = self._pairs_of_frames()
@@ -122,14 +120,16 @@ class _ModelContext:
 
     def is_of_one_viewpoint(self, pair: VerifiedPair) -> bool:
         """Tell whether both images of a pair were taken from the same viewpoint."""
-        viewpoint1, viewpoint2 = (self.viewpoint_of.get(i, i) for i in pair.ids)
+        first, second = pair.ids
+        viewpoint1 = self.viewpoint_of.get(first, first)
+        viewpoint2 = self.viewpoint_of.get(second, second)
         return viewpoint1 == viewpoint2
 
     def _pairs_of_frames(self) -> dict[int, list[VerifiedPair]]:
         """Return the pairs of each frame with others: poses inside a rig determine each other."""
-        found: dict[int, list[VerifiedPair]] = {
-            self.frame_of(i): [] for i in self.pairs_of
-        }
+        found: dict[int, list[VerifiedPair]] = {}
+        for image_id in self.pairs_of:
+            found[self.frame_of(image_id)] = []
         for image_id, pairs in self.pairs_of.items():
             for pair in pairs:
                 first, second = pair.ids
@@ -165,35 +165,32 @@ def features_of(
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
-    bridges = _cut_pairs(context)
+    cut_pairs = _cut_pairs(context)
     directions_deg = _direction_sigmas_deg(context, tie_points)
     names = context.graph.names
     found = {}
     for image_id in context.pairs_of:
         camera = context.cameras[image_id]
         key = camera.camera_id
-        focal_px = float(camera.mean_focal_length())
-        log_ratio = _pair_log_ratio(context, image_id) + track_log_ratios.get(
-            image_id, 0.0
-        )
-        bridge = bridges.get(image_id)
+        log_ratio = _pair_log_ratio(context, image_id)
+        log_ratio += track_log_ratios.get(image_id, 0.0)
+        cut_pair = cut_pairs.get(image_id)
+        original = originals.get(image_id)
         found[names[image_id]] = ReliabilityFeatures(
             log_likelihood_ratio=log_ratio - context.priors[key].cost_of(camera),
             agreement=_agreeing_share(context, image_id),
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
-            focal_px=focal_px,
+            focal_px=float(camera.mean_focal_length()),
             fitting_focal_px=fitting_focals_px.get(key, 0.0),
             pure_rotation_ratio=_pure_rotation_ratio(
                 context, image_id, rotation_ratios
             ),
-            mirrored_original=names[originals[image_id]]
-            if image_id in originals
-            else "",
+            mirrored_original="" if original is None else names[original],
             focal_spread=focal_spreads.get((camera.width, camera.height), 1.0),
             tie_point_log_odds=log_odds.get(image_id, 0.0),
-            cut_pair=" - ".join(names[i] for i in bridge.ids) if bridge else "",
-            num_cut_pair_inliers=len(bridge.matches) if bridge else 0,
+            cut_pair=" - ".join(names[i] for i in cut_pair.ids) if cut_pair else "",
+            num_cut_pair_inliers=len(cut_pair.matches) if cut_pair else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
         )
@@ -245,9 +242,9 @@ def _pure_rotation_ratio(
     context: _ModelContext, image_id: int, ratios: Mapping[Ids, float]
 ) -> float:
     """Return the mean ratio of the pairs of an image's frame, of all pairs where it has none."""
-    with_frame = context.pairs_of_frames[context.frame_of(image_id)]
-    own = [ratios[pair.ids] for pair in with_frame if pair.ids in ratios]
-    known = own or list(ratios.values())
+    pairs = context.pairs_of_frames[context.frame_of(image_id)]
+    ratios_of_frame = [ratios[pair.ids] for pair in pairs if pair.ids in ratios]
+    known = ratios_of_frame or list(ratios.values())
     return float(np.mean(known)) if known else 0.0
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.geometry.parallax import correlation, same_view_homography
 from colmap_affrect.images.reading import read_gray
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 
 MIN_CORRELATION = 0.65
 """Of two photographs, one warped onto the other; measured: photographs of one thing from nearby

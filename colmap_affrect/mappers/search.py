@@ -348,9 +348,8 @@ class _BestModels:
 
     def __init__(self, scorer: ModelScorer) -> None:
         self.scorer = scorer
-        self.num_without_gain = (
-            0  # models in a row that scored no higher than all before
-        )
+        # Models in a row that scored no higher than all before
+        self.num_without_gain = 0
         self._best_score = 0.0
         self._models: dict[frozenset[int], pycolmap.Reconstruction] = {}
         self._scores: dict[frozenset[int], float] = {}

@@ -33,9 +33,8 @@ from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
 # What made a model, in the words of a report.
-MEASURED_PAIRS = (
-    "with the pairs of measured frames"  # others also verify sides that look the same
-)
+# Others also verify sides that look the same
+MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
 SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
@@ -45,9 +44,8 @@ SHIFTED_AXES = "with optical axes off the middle"
 
 # Of COLMAP's models, the largest ones, that are gone on from; resource
 NUM_COLMAP_MODELS = 2
-FORWARD_MOTION = (
-    "mapper.init_max_forward_motion"  # option of pycolmap that users may give
-)
+# Option of pycolmap that users may give
+FORWARD_MOTION = "mapper.init_max_forward_motion"
 # Images from which on COLMAP's own pipeline maps: the search would take too long; resource
 MIN_LARGE_SET = 100
 
@@ -218,15 +216,19 @@ class SparseMapper(IncrementalMapper):
                 )
         priors = self._priors(task, graph, native)
         adjuster = Adjuster(
-            priors,
-            self.options.noise_px,
-            native.get_global_bundle_adjustment(),
-            self._constant_cameras(task, graph, native),
-            constant_frames,
-            tie_points_of(task, graph),
+            priors=priors,
+            noise_px=self.options.noise_px,
+            refining=native.get_global_bundle_adjustment(),
+            constant=self._constant_cameras(task, graph, native),
+            constant_frames=constant_frames,
+            tie_points=tie_points_of(task, graph),
         )
         return Search(
-            adjuster, ModelScorer(graph, priors), native, self.options.num_seeds, show
+            adjuster=adjuster,
+            scorer=ModelScorer(graph, priors),
+            native=native,
+            max_models_without_gain=self.options.num_seeds,
+            show=show,
         )
 
     def _priors(
@@ -237,22 +239,20 @@ class SparseMapper(IncrementalMapper):
     ) -> dict[int, CameraPrior]:
         """Return the priors of the focal lengths, by camera id."""
         if not native.ba_refine_focal_length:  # then they are those of the database
-            used = {camera.camera_id: camera for camera in graph.cameras.values()}
-            return {
-                k: CameraPrior(float(c.mean_focal_length()), 0.0)
-                for k, c in used.items()
-            }
+            constant = {}
+            for camera in graph.cameras.values():
+                focal_px = float(camera.mean_focal_length())
+                constant[camera.camera_id] = CameraPrior(focal_px, sigma=0.0)
+            return constant
         priors = camera_priors(graph.cameras.values(), task.cameras, task.lines)
         if not self.options.keep_given_intrinsics:
             for key, prior in priors.items():
                 priors[key] = replace(prior, sigma=prior.sigma or EXIF_SIGMA)
-        told = cameras_that_tell_distortion(graph)
-        return {
-            key: replace(
-                prior, has_distortion=key in told or prior.has_prior_focal_length
-            )
-            for key, prior in priors.items()
-        }
+        with_distortion = cameras_that_tell_distortion(graph)
+        for key, prior in priors.items():
+            has_distortion = key in with_distortion or prior.has_prior_focal_length
+            priors[key] = replace(prior, has_distortion=has_distortion)
+        return priors
 
     def _constant_cameras(
         self,
@@ -352,11 +352,11 @@ class _HypothesisTest:
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
             models = _of_some_tracks(self.search, graph) or self.search.best(graph)
-            return _made_by(hypothesis.name, models)
+            return [mapped.first_by(hypothesis.name) for mapped in models]
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
         models = self.search.extend_models(graph, self.best)
-        return [_also_by(hypothesis.name, mapped) for mapped in models]
+        return [mapped.also_by(hypothesis.name) for mapped in models]
 
     def _take(self, models: Sequence[MappedModel], score: float) -> None:
         self.best = list(models)
@@ -386,7 +386,7 @@ class _HypothesisTest:
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
         if found and score > self.score + MIN_SCORE_GAIN:
-            self._take(_made_by(COLMAP_MODEL, found), score)
+            self._take([mapped.first_by(COLMAP_MODEL) for mapped in found], score)
 
     def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
         """Go on with the cameras, and the optical axes, that models had."""
@@ -437,11 +437,8 @@ class _HypothesisTest:
         model = self.best[0].reconstruction
         changed = with_shifted_axes(model, free, search.graph)
         share = self._motion_share(self.best[0])
-        changed_model = _also_by(
-            SHIFTED_AXES,
-            replace(self.best[0], reconstruction=changed, motion_share=share),
-        )
-        found = free.with_bridges(search.graph, [changed_model])
+        first = replace(self.best[0], reconstruction=changed, motion_share=share)
+        found = free.with_bridges(search.graph, [first.also_by(SHIFTED_AXES)])
         found = with_new_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
         # That the points ask for it has paid for the principal points.
@@ -467,13 +464,10 @@ class _HypothesisTest:
         if score <= self.score + MIN_SCORE_GAIN:
             return
         share = self._motion_share(first)
-        changed = _also_by(
-            PER_IMAGE_CAMERAS,
-            replace(first, reconstruction=model, motion_share=share),
-        )
+        changed = replace(first, reconstruction=model, motion_share=share)
         # The others, too: what is shared and what is not do not fit into one graph.
         others = [_remade(self.per_image, mapped) for mapped in self.best[1:]]
-        self.best = with_new_images([changed, *others])
+        self.best = with_new_images([changed.also_by(PER_IMAGE_CAMERAS), *others])
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
@@ -500,24 +494,9 @@ def _joined_by_tie_points(
     return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
 
 
-def _made_by(name: str, models: Sequence[MappedModel]) -> list[MappedModel]:
-    """Return models with the name of a hypothesis before those that each of them has."""
-    found = list[MappedModel]()
-    for mapped in models:
-        hypotheses = tuple(dict.fromkeys((name, *mapped.hypotheses)))
-        found.append(replace(mapped, hypotheses=hypotheses))
-    return found
-
-
-def _also_by(name: str, mapped: MappedModel) -> MappedModel:
-    """Return a model with the name of a hypothesis after those that it has."""
-    hypotheses = tuple(dict.fromkeys((*mapped.hypotheses, name)))
-    return replace(mapped, hypotheses=hypotheses)
-
-
 def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
     """Return models with the poses of previous ones, and all that their tracks now register."""
-    return with_new_images(_also_by(AGAIN, _remade(search, one)) for one in previous)
+    return with_new_images(_remade(search, one).also_by(AGAIN) for one in previous)
 
 
 def _remade(search: Search, mapped: MappedModel) -> MappedModel:

@@ -18,7 +18,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.connections import connected_parts
-from colmap_affrect.geometry.arrays import Array, Bools, Indices
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, sampling_step
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.model_score import (
     GRID,
@@ -27,7 +27,7 @@ from colmap_affrect.mappers.model_score import (
     beta_log_ratio,
     grid_cells,
 )
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, sampling_step
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 from colmap_affrect.project.reasons import DoubtCode
 
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
@@ -68,16 +68,28 @@ class Overlap:
     @property
     def log_ratio(self) -> float:
         """Log-likelihood ratio of one place against two, 0 where too little is expected."""
-        if not self.tells:
+        if not self.has_enough:
             return 0.0
         return beta_log_ratio(
-            self.num_found, self.num_expected, SAME_PLACE, OTHER_PLACE
+            num_agreeing=self.num_found,
+            num=self.num_expected,
+            right=SAME_PLACE,
+            wrong=OTHER_PLACE,
         )
 
     @property
-    def tells(self) -> bool:
-        """Whether enough is expected."""
+    def has_enough(self) -> bool:
+        """Whether enough is expected to tell anything."""
         return self.num_expected >= MIN_EXPECTED
+
+
+@dataclass(frozen=True)
+class _Observed:
+    """Points that an image observes."""
+
+    points_px: Array  # (N, 2)
+    ids: Indices  # (N,)
+    positions: Array  # (N, 3)
 
 
 @dataclass(frozen=True)
@@ -95,35 +107,38 @@ class _Views:
     def __init__(self, model: pycolmap.Reconstruction) -> None:
         self.model = model
         self._expectations = dict[Ids, _Expected]()
-        self._seen = dict[int, tuple[Array, Indices, Array]]()
-        self._observed = dict[int, Indices]()
+        self._samples = dict[int, _Observed]()
+        self._observed_ids = dict[int, Indices]()
 
-    def seen(self, image_id: int) -> tuple[Array, Indices, Array]:
-        """Return (N, 2) px, (N,) ids and (N, 3) positions of points that an image observes."""
-        if image_id not in self._seen:
+    def sample(self, image_id: int) -> _Observed:
+        """Return some of the points that an image observes."""
+        if image_id not in self._samples:
             observed = self.model.images[image_id].get_observation_points2D()
             kept = observed[:: sampling_step(len(observed), MAX_NUM_POINTS)]
-            points_px = np.array([mark.xy for mark in kept]).reshape(-1, 2)
-            ids = np.array([mark.point3D_id for mark in kept], np.int64)
-            points = [self.model.points3D[mark.point3D_id].xyz for mark in kept]
-            positions = np.array(points).reshape(-1, 3)
-            self._seen[image_id] = points_px, ids, positions
-        return self._seen[image_id]
+            points_px = [keypoint.xy for keypoint in kept]
+            ids = [keypoint.point3D_id for keypoint in kept]
+            positions = [self.model.points3D[point_id].xyz for point_id in ids]
+            self._samples[image_id] = _Observed(
+                points_px=np.array(points_px).reshape(-1, 2),
+                ids=np.array(ids, np.int64),
+                positions=np.array(positions).reshape(-1, 3),
+            )
+        return self._samples[image_id]
 
     def observes(self, image_id: int, ids: Indices) -> Bools:
         """Return which points an image observes, of all and not of a sample."""
-        if image_id not in self._observed:
+        if image_id not in self._observed_ids:
             observed = self.model.images[image_id].get_observation_points2D()
-            self._observed[image_id] = np.array([p.point3D_id for p in observed])
-        return np.isin(ids, self._observed[image_id])
+            self._observed_ids[image_id] = np.array([p.point3D_id for p in observed])
+        return np.isin(ids, self._observed_ids[image_id])
 
     def overlap(self, first: int, second: int) -> Overlap:
         """Return the mean of what is expected and found of both images in the other one."""
-        there = self.overlap_with(second, [first])
-        back = self.overlap_with(first, [second])
+        in_second = self.overlap_with(second, [first])
+        in_first = self.overlap_with(first, [second])
         return Overlap(
-            (there.num_expected + back.num_expected) / 2,
-            (there.num_found + back.num_found) / 2,
+            num_expected=(in_second.num_expected + in_first.num_expected) / 2,
+            num_found=(in_second.num_found + in_first.num_found) / 2,
         )
 
     def regions_differ(self, image_id: int, first: set[int], second: set[int]) -> bool:
@@ -134,18 +149,21 @@ class _Views:
             first: Other images.
             second: Others.
         """
-        points_px, ids, _ = self.seen(image_id)
+        region1 = self._shared_region(image_id, first)
+        region2 = self._shared_region(image_id, second)
+        num_smaller = min(len(region1), len(region2))
+        num_common = len(region1 & region2)
+        return num_smaller > 0 and num_common <= MAX_COMMON * num_smaller
+
+    def _shared_region(self, image_id: int, others: Collection[int]) -> set[int]:
+        """Return the cells of an image with points that any of some other images observe."""
+        observed = self.sample(image_id)
         camera = self.model.cameras[self.model.images[image_id].camera_id]
-        cells = grid_cells(camera, points_px)
-        regions = []
-        for side in (first, second):
-            is_shared = np.zeros(len(ids), bool)
-            for other in side:
-                is_shared |= self.observes(other, ids)
-            regions.append(set(cells[is_shared].tolist()))
-        smaller = min(map(len, regions))
-        common = len(regions[0] & regions[1])
-        return smaller > 0 and common <= MAX_COMMON * smaller
+        cells = grid_cells(camera, observed.points_px)
+        is_shared = np.zeros(len(cells), bool)
+        for other in others:
+            is_shared |= self.observes(other, observed.ids)
+        return set(cells[is_shared].tolist())
 
     def overlap_with(
         self, target: int, sources: Collection[int], clump: float = 1.0
@@ -159,10 +177,10 @@ class _Views:
             sources: The others.
             clump: Matches that come together.
         """
-        found = [self._expected(source, target) for source in sources]
-        ids = np.concatenate([one.ids for one in found])
-        cells = np.concatenate([one.cells for one in found])
-        is_found = np.concatenate([one.is_found for one in found])
+        expected = [self._expected(source, target) for source in sources]
+        ids = np.concatenate([points.ids for points in expected])
+        cells = np.concatenate([points.cells for points in expected])
+        is_found = np.concatenate([points.is_found for points in expected])
         _, first_rows = np.unique(ids, return_index=True)
         return _counted(cells[first_rows], is_found[first_rows], clump)
 
@@ -173,7 +191,8 @@ class _Views:
         return self._expectations[source, target]
 
     def _expectation(self, source: int, target: int) -> _Expected:
-        _, ids, positions = self.seen(source)
+        ids = self.sample(source).ids
+        positions = self.sample(source).positions
         if not len(ids):
             return _Expected(ids, ids, ids > 0)
         camera = self.model.cameras[self.model.images[target].camera_id]
@@ -216,23 +235,23 @@ class _Views:
             points_px: (N, 2) px where it would see them.
             depths: (N,) in its camera.
         """
-        own, _, positions = self.seen(image_id)
-        if len(own) < NUM_NEIGHBORS:
+        known = self.sample(image_id)
+        if len(known.ids) < NUM_NEIGHBORS:
             return np.zeros(len(points_px), bool)
         image = self.model.images[image_id]
         pose = image.cam_from_world().matrix()
-        own_depths = positions @ pose[2, :3] + pose[2, 3]
+        known_depths = known.positions @ pose[2, :3] + pose[2, 3]
         camera = self.model.cameras[image.camera_id]
         radius_px = SURFACE_RADIUS * max(camera.width, camera.height)
-        across = points_px[:, :1] - own[:, 0]
-        down = points_px[:, 1:] - own[:, 1]
+        across = points_px[:, :1] - known.points_px[:, 0]
+        down = points_px[:, 1:] - known.points_px[:, 1]
         squares = across * across + down * down
         nearest = np.argpartition(squares, NUM_NEIGHBORS - 1, axis=1)
         nearest = nearest[:, :NUM_NEIGHBORS]
         farthest = np.take_along_axis(squares, nearest, axis=1).max(axis=1)
-        is_known = farthest < radius_px * radius_px
-        surfaces = np.median(own_depths[nearest], axis=1)
-        return np.asarray(is_known & (depths > HIDDEN * surfaces))
+        is_near = farthest < radius_px * radius_px
+        surfaces = np.median(known_depths[nearest], axis=1)
+        return np.asarray(is_near & (depths > HIDDEN * surfaces))
 
 
 def _projected(camera: pycolmap.Camera, local: Array) -> Array:
@@ -313,12 +332,17 @@ def places_of(model: pycolmap.Reconstruction, graph: PairGraph) -> Places:
     views = _Views(model)
     overlaps = {pair.ids: views.overlap(*pair.ids) for pair in pairs}
     tied = list[Ids]()
-    for ids, one in overlaps.items():
-        if one.tells and one.log_ratio >= TIED:
+    for ids, overlap in overlaps.items():
+        if overlap.has_enough and overlap.log_ratio >= TIED:
             tied.append(ids)
     found = Places([])
     found.tied = connected_parts(tied, images)
-    merged = _merged(found.tied, overlaps, views, found.unclear)
+    merged = _merged(
+        parts=found.tied,
+        pairs=overlaps,
+        views=views,
+        unclear=found.unclear,
+    )
     for place in merged:
         found.images += _cut_at_collages(place, overlaps, views, found.collages)
     found.images.sort(key=lambda part: (-len(part), min(part)))
@@ -392,7 +416,7 @@ def _best_merger(
 def _partners_between(
     first: set[int], second: set[int], pairs: Collection[Ids]
 ) -> dict[int, list[int]]:
-    """Return of each image that pairs tie to the other part the images there."""
+    """Return the partners in the other part of each image that pairs tie to it."""
     found = defaultdict[int, list[int]](list)
     for ids in pairs:
         is_between = not first.isdisjoint(ids) and not second.isdisjoint(ids)
@@ -408,7 +432,7 @@ def _joint_log_ratio(overlaps: Sequence[Overlap]) -> float:
 
     It grows with the root of their number, as if each told half of what it tells alone.
     """
-    ratios = [one.log_ratio for one in overlaps if one.tells]
+    ratios = [overlap.log_ratio for overlap in overlaps if overlap.has_enough]
     return float(np.sum(ratios) / np.sqrt(len(ratios))) if ratios else 0.0
 
 

@@ -32,27 +32,48 @@ def matches_of_best_tracks(
     # Features of all images are numbered one after the other; a track has its lowest number.
     image_ids = sorted(num_keypoints)
     counts = [num_keypoints[image_id] for image_id in image_ids]
-    starts = dict(zip(image_ids, np.cumsum([0, *counts[:-1]]), strict=True))
-    matches = list[Indices]()
-    for (first, second), of_pair in pairs:
-        matches.append(of_pair + np.array([starts[first], starts[second]]))
+    num_all = sum(counts)
+    matches = _numbered_through(pairs, image_ids, counts)
     edges = np.concatenate(matches)
-    track_of = _connected_components(edges, sum(counts))
+    track_of = _connected_components(edges, num_all)
     image_of = np.repeat(np.arange(len(image_ids)), counts)
-    features = np.unique(edges)
-    seen = np.unique(np.stack([track_of[features], image_of[features]]), axis=1)
-    tracks, images = seen
-    num_features = np.bincount(track_of[features], minlength=sum(counts))
-    num_images = np.bincount(tracks, minlength=sum(counts))
+    matched = np.unique(edges)
+    views = np.stack([track_of[matched], image_of[matched]])
+    tracks, images = np.unique(views, axis=1)
+    num_features = np.bincount(track_of[matched], minlength=num_all)
+    num_images = np.bincount(tracks, minlength=num_all)
     ranks = _ranks(num_features, num_images)
-    kept = np.zeros(len(ranks), bool)
+    is_kept = np.zeros(num_all, bool)
     for index in range(len(image_ids)):
-        of_image = tracks[images == index]
-        kept[_best(of_image, ranks, NUM_TRACKS)] = True
+        tracks_of_image = tracks[images == index]
+        is_kept[_best(tracks_of_image, ranks, NUM_TRACKS)] = True
     tracks_of_pairs = [track_of[of_pair[:, 0]] for of_pair in matches]
-    for of_pair in tracks_of_pairs:
-        kept[_best(of_pair, ranks, NUM_MATCHES_OF_PAIR)] = True
-    return [kept[of_pair] for of_pair in tracks_of_pairs]
+    for tracks_of_pair in tracks_of_pairs:
+        is_kept[_best(tracks_of_pair, ranks, NUM_MATCHES_OF_PAIR)] = True
+    return [is_kept[tracks_of_pair] for tracks_of_pair in tracks_of_pairs]
+
+
+def _numbered_through(
+    pairs: Sequence[tuple[tuple[int, int], Indices]],
+    image_ids: Sequence[int],
+    counts: Sequence[int],
+) -> list[Indices]:
+    """Return the matches of pairs by numbers that tell the features of all images apart.
+
+    Args:
+        pairs: Image ids, and (M, 2) features that match.
+        image_ids: Of all images, in the order in which their features are numbered.
+        counts: Numbers of features of these images.
+
+    Returns:
+        (M, 2) numbers for each pair.
+    """
+    first_numbers = np.cumsum([0, *counts[:-1]])
+    first_of = dict(zip(image_ids, first_numbers, strict=True))
+    found = list[Indices]()
+    for (first, second), matches in pairs:
+        found.append(matches + np.array([first_of[first], first_of[second]]))
+    return found
 
 
 def _connected_components(edges: Indices, num_nodes: int) -> Indices:
@@ -75,7 +96,7 @@ def _connected_components(edges: Indices, num_nodes: int) -> Indices:
 
 
 def _ranks(num_features: Indices, num_images: Indices) -> Indices:
-    """Return the place of each track in the order of choice, 0 for the best, (T,).
+    """Return the position of each track in the order of choice, 0 for the best, (T,).
 
     Args:
         num_features: Features of each track, (T,).

@@ -14,10 +14,10 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import AGREEING_SIGMAS, SIGMA_PX, triangulated
-from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.arrays import Array, sampling_step
 from colmap_affrect.geometry.two_views import NUM_NEIGHBORS
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.pair_graph import PairGraph, sampling_step
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.project.report import Residual
 
 # Residuals up to which a tie point agrees with a pose; theory
@@ -84,15 +84,14 @@ class TiePoints:
 
     def report(self, model: pycolmap.Reconstruction) -> tuple[Residual, ...]:
         """Return the residuals as a report has them, the worst first."""
+        residuals = self.residuals(model)
+        residuals.sort(key=lambda residual: -residual.error_px)
         found = list[Residual]()
-        for residual in sorted(
-            self.residuals(model), key=lambda residual: -residual.error_px
-        ):
-            name = model.images[residual.image_id].name
+        for residual in residuals:
             found.append(
                 Residual(
                     point=residual.point,
-                    image=name,
+                    image=model.images[residual.image_id].name,
                     error_px=round(residual.error_px, 2),
                 )
             )
@@ -119,15 +118,13 @@ class TiePoints:
             for image_id, xy in marks.items():
                 others = {i: mark for i, mark in marks.items() if i != image_id}
                 position = triangulated(model, others)
-                if (
-                    position is None
-                    or _max_mark_error_px(model, others, position) > AGREEING_PX
-                ):
+                if position is None:
                     continue
+                if _max_mark_error_px(model, others, position) > AGREEING_PX:
+                    continue
+                error_px = _mark_error_px(model, image_id, xy, position)
                 num_points[image_id] += 1
-                num_far[image_id] += (
-                    _mark_error_px(model, image_id, xy, position) > AGREEING_PX
-                )
+                num_far[image_id] += error_px > AGREEING_PX
         found = list[int]()
         for image_id, num in num_far.items():
             if num >= max(MIN_NUM_POINTS, num_points[image_id] / 2):
@@ -268,13 +265,14 @@ class _Surroundings:
         if image_id not in self._observed:
             self._observed[image_id] = self._observed_by(image_id)
         observed = self._observed[image_id]
-        distances = np.linalg.norm(observed.points_px - xy, axis=1)
-        nearest = np.argsort(distances)[:NUM_NEIGHBORS]
+        distances_px = np.linalg.norm(observed.points_px - xy, axis=1)
+        nearest = np.argsort(distances_px)[:NUM_NEIGHBORS]
         if len(nearest) < NUM_NEIGHBORS:
             return None
         image = self.model.images[image_id]
         camera = self.model.cameras[image.camera_id]
-        if distances[nearest[-1]] > MARK_RADIUS * max(camera.width, camera.height):
+        radius_px = MARK_RADIUS * max(camera.width, camera.height)
+        if distances_px[nearest[-1]] > radius_px:
             return None
         depth = np.median(observed.depths[nearest])
         ray = np.append(np.asarray(camera.cam_from_img(xy)).ravel(), 1.0)

@@ -241,11 +241,8 @@ def has_fast_8_bit_products() -> bool:
     unit = 1.0 / (128 * MAX_CODE**2)
     try:
         found = _cosine_codes(codes, _packed(codes), unit)
-    except (
-        AttributeError,
-        RuntimeError,
-        TypeError,
-    ):  # another torch, or one built otherwise
+    except (AttributeError, RuntimeError, TypeError):
+        # It is another torch, or one built otherwise
         return False
     wide = codes.astype(np.int32)
     expected = np.maximum(unit / CODE_STEP * (wide @ wide.T), 0.0)

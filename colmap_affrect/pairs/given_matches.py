@@ -57,10 +57,8 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
     if not path.is_file():
         raise OptionError("no such file", where=path)
     with path.open("rb") as file:
-        is_text = (
-            file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE and path.suffix != ".h5"
-        )
-    if is_text:
+        has_signature = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+    if not has_signature and path.suffix != ".h5":
         yield _read_list(path, names)
         return
     with open_given_file(path) as source:
@@ -197,7 +195,8 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
                     where=path,
                 )
             end = _end_of_matches(lines, number)
-            if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
+            is_known = pair in found or pair[::-1] in found
+            if pair[0] != pair[1] and not is_known:
                 numbers = " ".join(lines[number:end]).split()
                 found[pair] = np.array(numbers, np.int64).reshape(-1, 2)
             number = end

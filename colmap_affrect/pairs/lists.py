@@ -1,10 +1,11 @@
-"""Lists of pairs: all, by sequence or place, the most similar; their order, and their files."""
+"""Lists of pairs: all, by sequence or position, the most similar; their order, and their files."""
 
 import difflib
 import io
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, overload
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.errors import OptionError, clipped, not_utf_8
-from colmap_affrect.geometry.arrays import Bools, Indices
+from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import resolved
@@ -135,37 +136,63 @@ def most_similar_pairs(
     Returns:
         The pairs, sorted.
     """
-    lower = []  # by image, with those most similar to it: the smaller index of each pair
+    candidates = _candidate_pairs(similarities, CANDIDATES_PER_NEIGHBOR * num_neighbors)
+    if candidates is None:
+        return []
+    is_extra = candidates.ranks >= (num_neighbors + 1) // 2
+    best_first = np.lexsort((-candidates.similarities, is_extra))
+    codes = candidates.lower * len(names) + candidates.higher
+    _, found_first = np.unique(codes[best_first], return_index=True)
+    ranked = best_first[np.sort(found_first)]  # each pair once
+    num_of_images = np.count_nonzero(~is_extra[ranked])
+    num_wanted = len(names) * num_neighbors // 2
+    pairs = []
+    for chosen in ranked[: max(num_wanted, num_of_images)]:
+        one = names[candidates.lower[chosen]]
+        other = names[candidates.higher[chosen]]
+        pairs.append((min(one, other), max(one, other)))
+    return sorted(pairs)
+
+
+@dataclass(frozen=True)
+class _CandidatePairs:
+    """Each image with those that are most similar to it, as (M,) arrays."""
+
+    lower: Indices  # smaller index of the two images
+    higher: Indices
+    similarities: Singles
+    ranks: Indices  # how many images are more similar to the one
+
+
+def _candidate_pairs(
+    similarities: Iterable[NDArray[np.number]], num_of_image: int
+) -> _CandidatePairs | None:
+    """Pair each image with so many that are most similar to it; None without images.
+
+    Args:
+        similarities: for each image its (N,) similarities with all, itself included.
+        num_of_image: pairs of each image, at most.
+    """
+    lower = []
     higher = []
-    similarity = []
-    rank = []  # how many images are more similar to it
+    found_similarities = []
+    ranks = []
     for index, row in enumerate(similarities):
         values = row.astype(np.float32)
         order = np.argsort(-values, kind="stable")
-        others = order[order != index][: CANDIDATES_PER_NEIGHBOR * num_neighbors]
+        others = order[order != index][:num_of_image]
         lower.append(np.minimum(others, index))
         higher.append(np.maximum(others, index))
-        similarity.append(values[others])
-        rank.append(np.arange(len(others)))
+        found_similarities.append(values[others])
+        ranks.append(np.arange(len(others)))
     if not lower:
-        return []
-    is_extra = np.concatenate(rank) >= (num_neighbors + 1) // 2
-    best_first = np.lexsort((-np.concatenate(similarity), is_extra))
-    firsts = np.concatenate(lower)
-    seconds = np.concatenate(higher)
-    _, found_first = np.unique(
-        (firsts * len(names) + seconds)[best_first], return_index=True
+        return None
+    return _CandidatePairs(
+        lower=np.concatenate(lower),
+        higher=np.concatenate(higher),
+        similarities=np.concatenate(found_similarities),
+        ranks=np.concatenate(ranks),
     )
-    ranked = best_first[np.sort(found_first)]  # each pair once
-    num_pairs = max(
-        len(names) * num_neighbors // 2, np.count_nonzero(~is_extra[ranked])
-    )
-    pairs = []
-    for chosen in ranked[:num_pairs]:
-        one = names[firsts[chosen]]
-        other = names[seconds[chosen]]
-        pairs.append((min(one, other), max(one, other)))
-    return sorted(pairs)
 
 
 def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:

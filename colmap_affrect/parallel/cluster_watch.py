@@ -32,9 +32,8 @@ class ClusterWatch:
         self._client = client
         self._address = address
         self._clock = clock
-        self._heard: dict[
-            str, tuple[float, float]
-        ] = {}  # when, by the scheduler and by us
+        # When each was heard of, by the scheduler and by us
+        self._heard: dict[str, tuple[float, float]] = {}
         self._asked_s = -ASK_EVERY_S
         self._lost_since_s: float | None = None
         self._has_warned = False
@@ -82,11 +81,8 @@ class ClusterWatch:
         start = f"start some with 'dask worker {self._address}' on each machine"
         try:
             workers = self._workers()
-        except (
-            OSError,
-            RuntimeError,
-            AttributeError,
-        ):  # the last two of a client that has closed
+        except (OSError, RuntimeError, AttributeError):
+            # A client that has closed raises the last two
             return "the scheduler does not answer any more; start 'dask scheduler' and workers"
         heard = [
             worker

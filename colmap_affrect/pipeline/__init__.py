@@ -51,6 +51,9 @@ from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.pairs import choose_pairs as list_pairs
 from colmap_affrect.stages.verify import verify_matches as verify_pairs
 
+# Photographs whose size tells that of all, for the forecast; resource
+MAX_NUM_SIZES = 20
+
 
 @takes_fields_of(RunOptions)
 def run(
@@ -119,7 +122,8 @@ def _run(
     names = _checked_names(inputs, options, mapper)
     num_pairs = _num_pairs(names, options=options.pairs, image_path=image_path)
     usable = options.resources.usable_levels(recipe.extraction)
-    forecast = forecast_of(recipe.levels, usable, len(names), num_pairs)
+    megapixels = _megapixels(names, image_path, recipe.extraction.max_image_size_px)
+    forecast = forecast_of(recipe.levels, usable, len(names), num_pairs, megapixels)
     context = replace(context, progress=replace(context.progress, forecast=forecast))
     _prepare_parts(context, recipe)
     later = options.later_stages()
@@ -208,6 +212,24 @@ def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> 
     count = math.comb(len(names), 2)
     is_all = "exhaustive" in options.methods
     return count if is_all else min(count, len(names) * options.num_neighbors)
+
+
+def _megapixels(names: Sequence[str], image_path: Path, max_size_px: int) -> float:
+    """Return about how many megapixels photographs have at the size of processing.
+
+    Args:
+        names: of the photographs, of which some are looked at.
+        image_path: their folder.
+        max_size_px: longest side that is worked with.
+    """
+    step = max(1, len(names) // MAX_NUM_SIZES)
+    found = []
+    for name in names[::step]:
+        size = header_size(image_path / name)
+        if size is not None:
+            shrinking = min(1.0, max_size_px / max(size))
+            found.append(size[0] * size[1] * shrinking**2 / 1e6)
+    return len(names) * sum(found) / len(found) if found else 0.0
 
 
 def context_of(

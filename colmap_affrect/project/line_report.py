@@ -18,9 +18,8 @@ from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.options import documented
 
 FILM_MM = 36.0  # longer side of small-format film, for which lenses are compared
-SEGMENTS = (
-    "line_segments"  # (N, 4) starts and ends, longer sides from the middle of the image
-)
+# (N, 4) starts and ends, longer sides from the middle of the image
+SEGMENTS = "line_segments"
 LIKELIHOODS = "line_log_likelihoods"  # (F, S) of focal lengths and shifts
 ROTATIONS = "line_rotations"  # (F, S, 3, 3)
 DISTORTION = "line_distortion"  # (1,), of :meth:`Segments.undistorted`

@@ -12,9 +12,8 @@ from pydantic import TypeAdapter
 from colmap_affrect.options import EffortName
 
 Names = tuple[str, str]  # of a pair of images
-Worth = tuple[
-    int, int
-]  # inliers; where there are none, how many matches confirm each other
+# Inliers; where there are none, how many matches confirm each other
+Worth = tuple[int, int]
 Size = tuple[int, int]  # width and height in px
 Cell = tuple[int, int]  # column and row
 

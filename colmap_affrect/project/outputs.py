@@ -38,9 +38,8 @@ MARKS = {
 LONGEST_NAME = 255  # bytes that file systems take; format
 # There has to be room for the longer names of what is beside it meanwhile; format
 MAX_NAME_BYTES = LONGEST_NAME - 35
-SPARE_BYTES = (
-    1 << 16
-)  # a disk with less room may have cut off what was written last; resource
+# A disk with less room may have cut off what was written last; resource
+SPARE_BYTES = 1 << 16
 BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are; format
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}  # in folders that look empty
 

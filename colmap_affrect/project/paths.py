@@ -29,9 +29,8 @@ def as_path(given: PathLike, argument: str = "") -> Path:
         raise OptionError(
             f"give a path as str or os.PathLike, not {kind}", where=named
         ) from error
-    if not os.fspath(
-        given
-    ):  # Path takes it for the current folder, and nobody means that
+    # Path takes an empty one for the current folder, which nobody means
+    if not os.fspath(given):
         raise OptionError(
             "an empty text is no path", advice="the current folder is '.'"
         )

@@ -4,7 +4,7 @@ import json
 import math
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any
@@ -327,6 +327,11 @@ NO_MODEL = ModelSummary(
 )
 
 
+def largest_of(models: Sequence[ModelSummary]) -> ModelSummary:
+    """Return the first of models, which is the largest; an empty one where there are none."""
+    return models[0] if models else NO_MODEL
+
+
 @documented
 @dataclass(frozen=True)
 class ReconstructionReport(Summarized):
@@ -427,7 +432,7 @@ class ReconstructionReport(Summarized):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
-        largest = self.models[0] if self.models else NO_MODEL
+        largest = largest_of(self.models)
         of_largest = asdict(largest)
         found = asdict(self)
         del found["verification"]["random_seed"]

@@ -171,13 +171,20 @@ def plan_dense_shapes(
             continue
         # The canvas of a warp is the bounding box of its region. Of a region with several parts one
         # canvas for each is far smaller than one for all.
-        parts = (
-            _connected_parts(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
-        )
+        parts = [blocks]
+        if options.min_part_frac:
+            parts = _connected_parts(blocks, GAP_BLOCKS)
         for part in parts:
             if np.count_nonzero(part) >= min_part_blocks:
                 region = _region_of_blocks(part, grid.step_px, image_size)
-                items.append(options.warp(region, tilt, angle, label))
+                items.append(
+                    options.warp(
+                        region=region,
+                        tilt=tilt,
+                        angle_rad=angle,
+                        segment_id=label,
+                    )
+                )
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 
@@ -199,8 +206,10 @@ def _region_of_blocks(
     cropped = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     left = int(columns[0]) * step_px
     top = int(rows[0]) * step_px
+    width_inside = image_size[0] - left
+    height_inside = image_size[1] - top
     mask = np.repeat(np.repeat(cropped, step_px, axis=0), step_px, axis=1)
-    return Region(mask[: image_size[1] - top, : image_size[0] - left], (left, top))
+    return Region(mask=mask[:height_inside, :width_inside], origin=(left, top))
 
 
 def _connected_parts(mask: Mask, gap: int) -> list[Mask]:

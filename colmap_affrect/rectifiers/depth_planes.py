@@ -117,11 +117,11 @@ def planar_segments(
     """
     given_size = (depth.shape[1], depth.shape[0])
     depth, shrunk_from_given = planes.shrink_depth(depth, MAX_DEPTH_SIZE_PX)
-    depth_from_image = shrunk_from_given @ resized_from_original(
-        photograph.size, given_size
-    )
+    given_from_image = resized_from_original(photograph.size, given_size)
+    depth_from_image = shrunk_from_given @ given_from_image
+    depth_camera = depth_from_image @ photograph.camera_matrix
     clusters = planes.cluster_normals(
-        planes.normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
+        planes.normals_from_depth(depth, depth_camera),
         num_candidates=options.num_candidates,
         bin_angle_rad=np.deg2rad(options.bin_angle_deg),
         min_separation_rad=np.deg2rad(options.min_separation_deg),
@@ -212,5 +212,12 @@ class DepthAffNet(WithInputs):
             is_inside = segment.region.contains(samples.points)
             cover = options.cover(samples.metrics[is_inside])
             for tilt, angle in cover.centers.tolist():
-                items.append(options.warp(segment.region, tilt, angle, number))
+                items.append(
+                    options.warp(
+                        region=segment.region,
+                        tilt=tilt,
+                        angle_rad=angle,
+                        segment_id=number,
+                    )
+                )
         return RectificationPlan(photograph.size, tuple(items))

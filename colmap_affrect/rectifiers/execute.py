@@ -62,16 +62,17 @@ def extract_rectified(
     views = _views(image, warps, mask)
     detected = [extractor.detect(view) for view in views]
     keep = _kept(detected, warps, plan, max_num_rectified)
-    selected = [
-        features.select(kept) for features, kept in zip(detected, keep, strict=True)
-    ]
-    described = extractor.describe([view[0] for view in views], selected)
+    selected = list[LocalFeatures]()
+    for features, kept in zip(detected, keep, strict=True):
+        selected.append(features.select(kept))
+    images = [view[0] for view in views]
+    described = extractor.describe(images, selected)
     first_id = 0 if with_original else 1
-    parts = []
-    for number, (features, warp_plan) in enumerate(
-        zip(described, warps, strict=True), first_id
-    ):
-        parts.append(_mapped_back(features, warp_plan).with_rectification_id(number))
+    of_views = zip(described, warps, strict=True)
+    parts = list[LocalFeatures]()
+    for number, (features, rectification) in enumerate(of_views, first_id):
+        mapped = _mapped_back(features, rectification)
+        parts.append(mapped.with_rectification_id(number))
     return union(parts)
 
 

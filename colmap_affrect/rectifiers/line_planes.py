@@ -27,7 +27,7 @@ from colmap_affrect.rectifiers.regions import homography_rectification
 
 MAP_SIZE_PX = 160  # longer side of the maps of where segments lie; resource
 REACH = 0.04  # longer sides; a segment tells of a plane about so far around it; judged
-# Of segments, in units of a single long one that runs through the place; judged
+# Of segments, in units of a single long one that runs through a pixel; judged
 MIN_DENSITY = 0.3
 # Of directions, which span a plane; theory
 PAIRS = tuple(itertools.combinations(range(3), 2))
@@ -93,9 +93,9 @@ class LinePlanes(WithInputs):
             return []
         height, width = is_of_plane.shape
         cosines = planes.viewing_cosines(normal, camera, (width, height))
-        is_seen = is_of_plane & (
-            cosines >= math.cos(math.radians(self.options.max_angle_deg))
-        )
+        min_cosine = math.cos(math.radians(self.options.max_angle_deg))
+        max_mean_cosine = math.cos(math.radians(self.options.min_angle_deg))
+        is_seen = is_of_plane & (cosines >= min_cosine)
         min_area_px = self.options.min_region_frac * is_of_plane.size
         homography = planes.fronto_parallel_homography(normal, camera)
         items: list[Rectification] = []
@@ -103,9 +103,7 @@ class LinePlanes(WithInputs):
             left, top = region.origin
             rows, columns = region.mask.shape
             inside = cosines[top : top + rows, left : left + columns][region.mask]
-            if float(inside.mean()) <= math.cos(
-                math.radians(self.options.min_angle_deg)
-            ):
+            if float(inside.mean()) <= max_mean_cosine:
                 number = first_number + len(items)
                 items.append(homography_rectification(region, homography, number))
         return items
@@ -138,34 +136,31 @@ def plane_labels(
     densities = [
         _density(segments, explanation.kinds == kind, size) for kind in range(3)
     ]
-    both = np.stack(
-        [np.minimum(densities[first], densities[second]) for first, second in PAIRS]
-    )
-    labels = np.where(both.max(axis=0) >= MIN_DENSITY, both.argmax(axis=0), -1).astype(
-        np.int32
-    )
-    return np.asarray(
-        cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.int32
-    )
+    of_pairs = []
+    for first, second in PAIRS:
+        of_pairs.append(np.minimum(densities[first], densities[second]))
+    pair_densities = np.stack(of_pairs)
+    is_dense = pair_densities.max(axis=0) >= MIN_DENSITY
+    labels = np.where(is_dense, pair_densities.argmax(axis=0), -1).astype(np.int32)
+    resized = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized, dtype=np.int32)
 
 
 def _density(
     segments: Segments, is_chosen: NDArray[np.bool_], size: tuple[int, int]
 ) -> Singles:
-    """Return how many of the chosen segments lie around each place of a small map of the image."""
+    """Return how many of the chosen segments lie around each pixel of a small map of the image."""
     scale = MAP_SIZE_PX / max(size)
     width = max(1, round(scale * size[0]))
     height = max(1, round(scale * size[1]))
     drawn: Singles = np.zeros((height, width), np.float32)
     middle = np.array([width, height]) / 2.0 - HALF_PIXEL
-    for start, end in zip(
-        segments.starts[is_chosen], segments.ends[is_chosen], strict=True
-    ):
-        first = np.rint(start * MAP_SIZE_PX + middle).astype(int).tolist()
-        last = np.rint(end * MAP_SIZE_PX + middle).astype(int).tolist()
-        one = np.zeros_like(drawn)
-        cv2.line(one, first, last, 1.0)
-        drawn += one
+    starts = np.rint(segments.starts[is_chosen] * MAP_SIZE_PX + middle).astype(int)
+    ends = np.rint(segments.ends[is_chosen] * MAP_SIZE_PX + middle).astype(int)
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        one_line = np.zeros_like(drawn)
+        cv2.line(one_line, start, end, 1.0)
+        drawn += one_line
     sigma = REACH * MAP_SIZE_PX
     blurred = cv2.GaussianBlur(drawn, (0, 0), sigma)
     return np.asarray(blurred * (math.sqrt(2.0 * math.pi) * sigma), dtype=np.float32)

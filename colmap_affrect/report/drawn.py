@@ -39,9 +39,8 @@ class Drawn:
     """Tie points and masks of a page."""
 
     marks: Sequence[Mark]
-    masks: Mapping[
-        str, bytes
-    ]  # PNG by name of the photograph, black where nothing counts
+    # PNG by name of the photograph, black where nothing counts
+    masks: Mapping[str, bytes]
 
     @classmethod
     def of_request(cls, content: Any, names: Collection[str]) -> "Drawn":

@@ -37,12 +37,10 @@ SCRIPT = TEMPLATES / "serve.js"
 POLICY_BEGIN = "default-src 'none';"
 """How the Content-Security-Policy of a page begins, which then allows what the server needs."""
 SCRIPTS_BEGIN = "script-src"
-MAX_NUM_BYTES = (
-    64 << 20
-)  # of what a page sends: masks of some hundred photographs; resource
-MAX_DIGITS = (
-    19  # of the length of what a page sends: more are no number of bytes; format
-)
+# Of what a page sends: masks of some hundred photographs; resource
+MAX_NUM_BYTES = 64 << 20
+# Of the length of what a page sends: more are no number of bytes; format
+MAX_DIGITS = 19
 TIMEOUT_S = 30.0  # of a browser that says nothing more; resource
 NUM_TOKEN_BYTES = 16  # nobody guesses that; theory
 
@@ -59,9 +57,8 @@ class PageServer(ThreadingHTTPServer):
     """Serves the page of one run, and maps again what is drawn on it."""
 
     daemon_threads = True
-    allow_reuse_address = (
-        sys.platform != "win32"
-    )  # there, others could take the port over
+    # There, others could take the port over
+    allow_reuse_address = sys.platform != "win32"
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from colmap_affrect.colmap.connections import lone_ties
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.guided_store import GuidedPair
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport, largest_of
 
 MAX_NUM_PAIRS = 12  # in a page; more nobody looks at
 MAX_NUM_ORDINARY = 3  # pairs of each sort that nothing speaks against
@@ -65,7 +65,7 @@ def pairs_to_check(
     Returns:
         At most ``MAX_NUM_PAIRS`` pairs, names in order, with the reasons why they are shown.
     """
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    model = largest_of(report.models)
     strongest = _strongest_pairs(num_inliers, set(model.registered_names))
     registered = [name for name in model.registered_names if name in strongest]
     disagreeing = [pair for pair, share in agreement.items() if share < MIN_AGREEMENT]

@@ -12,9 +12,11 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pictures import base64_text
 
-MAX_NUM_LINES = 24_000  # of all pairs, 9 bytes each: a page stays below some MB
+MAX_NUM_LINES = 24_000  # of all pairs, 9 bytes each, while each pair has some; resource
 MAX_NUM_LINES_OF_PAIR = 120  # more hide what is below them
-MIN_NUM_LINES_OF_PAIR = 20  # fewer show little; then only the strongest pairs have some
+MIN_NUM_LINES_OF_PAIR = 20  # fewer show little
+# That a page draws, the strongest: all of 100 photographs, 1.2 MB and half a minute; resource
+MAX_NUM_PAIRS = 5_000
 MOST = 65_535  # of a uint16
 
 
@@ -36,7 +38,7 @@ class PairLines:
 def lines_of_pairs(
     reader: PairReader, names: Sequence[str], num_inliers: Mapping[Pair, int]
 ) -> PairLines:
-    """Read some inliers of each verified pair, or of the strongest pairs where there are many.
+    """Read some inliers of each verified pair, or of the strongest ones where there are very many.
 
     Args:
         reader: of the matches of a run.
@@ -49,8 +51,8 @@ def lines_of_pairs(
     index = {name: number for number, name in enumerate(names)}
     known = [pair for pair in num_inliers if {*pair} <= index.keys()]
     known.sort(key=lambda pair: -num_inliers[pair])
-    shown = known[: MAX_NUM_LINES // MIN_NUM_LINES_OF_PAIR]
-    num_lines = min(MAX_NUM_LINES_OF_PAIR, MAX_NUM_LINES // max(1, len(shown)))
+    shown = known[:MAX_NUM_PAIRS]
+    num_lines = num_lines_of_pair(len(shown))
     found = PairLines()
     ends = [np.empty((0, 4), dtype="<u2")]
     kinds = [np.empty(0, dtype=np.uint8)]
@@ -66,6 +68,12 @@ def lines_of_pairs(
         found.pairs.append((*numbers, len(rows), matched.text))
     data = np.concatenate(ends).tobytes() + np.concatenate(kinds).tobytes()
     return PairLines(found.pairs, base64_text(data))
+
+
+def num_lines_of_pair(num_pairs: int) -> int:
+    """Return how many lines each of some pairs has at most."""
+    fitting = MAX_NUM_LINES // max(1, num_pairs)
+    return max(MIN_NUM_LINES_OF_PAIR, min(MAX_NUM_LINES_OF_PAIR, fitting))
 
 
 def _some_inliers(pair: MatchedPair, max_num: int) -> Indices:

@@ -62,9 +62,8 @@ class PairReader:
             if model_path.exists()
             else pycolmap.Reconstruction()
         )
-        self.agreement = agreements(
-            self.graph, self.model
-        )  # share of inliers, by verified pair
+        # Share of inliers, by verified pair
+        self.agreement = agreements(self.graph, self.model)
         self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
 
     def read(self, names: Pair) -> MatchedPair:
@@ -164,9 +163,8 @@ class PairReader:
         text = f"{num_raw} raw matches"
         if self.run:
             pair = (min(names), max(names))
-            with suppress(
-                StoreError
-            ):  # another program has matched the pair, and not the run
+            # Another program has matched the pair, and not the run
+            with suppress(StoreError):
                 level = self.run.matches.levels([pair])[pair]
                 text += f" of level {level} ({self.run.extraction.levels[level].name})"
         text += f", {num_inliers} inliers"

@@ -102,10 +102,8 @@ def draw_matches(pair: MatchedPair, photographs: Sequence[ColorImage]) -> ColorI
         points[:, 0] += side * WIDTH_PX // 2
         ends.append(np.rint(points).astype(int).tolist())
     is_rejected = pair.kinds == MatchKind.REJECTED
-    for rows in (
-        np.flatnonzero(is_rejected),
-        np.flatnonzero(~is_rejected),
-    ):  # inliers on top
+    # The last ones, which are inliers, are on top
+    for rows in (np.flatnonzero(is_rejected), np.flatnonzero(~is_rejected)):
         spread = np.linspace(0, len(rows) - 1, min(len(rows), MAX_NUM_LINES)).astype(
             int
         )
@@ -208,9 +206,8 @@ def draw_pairs_to_check(
     photograph = cache(lambda name: read_color(image_path / name, SIDE_PX))
     pictures = []
     for names, why in chosen.items():
-        with suppress(
-            AffrectError
-        ):  # unreadable, or rejected by hand and never matched
+        # Unreadable, or rejected by hand and never matched
+        with suppress(AffrectError):
             pair = reader.read(names)
             drawn = draw_matches(pair, [photograph(name) for name in names])
             picture = Picture.from_image(shrink_to(drawn, 2 * SIDE_PX))

@@ -185,15 +185,10 @@ def facts_of(
     """
     facts = []
     if photograph.model is not None:
-        neighbours = f"{photograph.num_neighbours}"
-        if photograph.neighbours:
-            best = photograph.neighbours.items()
-            texts = [f"{name} ({count:,} points)" for name, count in best]
-            neighbours += f", most points with {', '.join(texts)}"
         facts += [
             ("Points", f"{photograph.num_points:,}"),
             ("Mean residual", _px(photograph.mean_error_px, 2)),
-            ("Neighbours", neighbours),
+            ("Neighbours", f"{photograph.num_neighbours}"),
         ]
     facts += [("Focal length", _focal_text(photograph))]
     if lines is not None:

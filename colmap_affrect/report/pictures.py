@@ -14,9 +14,8 @@ from colmap_affrect.progress import SILENT, Progress
 
 # Chosen so that a page of 40 photographs has at most 3 MB, and of 1000 a few more.
 JPEG_QUALITY = 70
-MAX_TOTAL_PX = (
-    5_500_000  # of all thumbnails of a page, as long as these stay large enough
-)
+# Of all thumbnails of a page, as long as these stay large enough
+MAX_TOTAL_PX = 5_500_000
 MAX_SIDE_PX = 640  # longer side of a thumbnail
 MIN_SIDE_PX = 126  # of a thumbnail in which one recognises the photograph
 MAX_NUM_THUMBNAILS = 1000

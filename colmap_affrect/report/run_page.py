@@ -1,5 +1,6 @@
 """A run as one page, ``report.html`` beside ``report.json``."""
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,12 +16,13 @@ from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.camera_notes import camera_notes, merge_shared_cameras
-from colmap_affrect.project.reasons import FATES, Doubt, text_of, texts_of
+from colmap_affrect.project.reasons import FATES, Doubt, text_of
 from colmap_affrect.project.report import (
     MAX_LINES,
     SOURCES,
     ModelSummary,
     by_story,
+    largest_of,
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
@@ -35,17 +37,19 @@ from colmap_affrect.report.photographs import (
 )
 from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.run_report import RunReport, contradiction_text
-from colmap_affrect.report.scene import MAX_NUM_OBSERVATIONS, View3D, read_view
-from colmap_affrect.report.verdict import QUALITIES, SIGNS, verdict_of
+from colmap_affrect.report.scene import View3D, max_num_observations, read_view
+from colmap_affrect.report.verdict import QUALITIES, SIGNS, tool_of, verdict_of
+from colmap_affrect.report.why_not_sure import groups_of
 
 # More would make a page too large to be read or sent.
 MAX_NUM_IN_MATRIX = 1000  # photographs; with more there is no matrix of inliers
 MAX_NUM_MODELS = 6  # that are drawn
+MAX_NUM_NAMED = 3  # photographs of a reason that are told by name; display
 MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 NUM_KEY_LETTERS = 16  # of the digests by which a browser keeps marks and masks
 
 SCRIPTS = ("page.js", "geometry.js", "pairs.js", "viewer.js")
-TOOL_SCRIPTS = ("tie_points.js", "masks.js")
+TOOL_SCRIPTS = ("tie_points.js", "places.js", "masks.js")
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,8 @@ class RunContent:
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
     pair_lines: PairLines = field(default_factory=PairLines)
-    cameras: Mapping[str, pycolmap.Camera] = field(
-        default_factory=dict
-    )  # in the database
+    # In the database
+    cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     marks_command: str = ""  # maps again with marks that are saved
     masks_command: str = ""  # runs anew with masks that are saved
 
@@ -121,13 +124,55 @@ def write_run_page(
             **_tools(report, content),
             "pair_lines": content.pair_lines.script_data(),
             "line_colors": list(LEGEND.values()),
-            "facts": [
-                facts_of(photographs[name], report.lines.get(name)) for name in names
-            ],
+            "facts": _facts(report, photographs, names),
+            "neighbours": _neighbours(report, photographs, names),
         },
         scripts=SCRIPTS + TOOL_SCRIPTS if can_mark else SCRIPTS,
     )
     return write_page(workspace.page, page, progress)
+
+
+def _facts(
+    report: RunReport,
+    photographs: Mapping[str, PhotographReport],
+    names: Sequence[str],
+) -> list[list[tuple[str, str]]]:
+    """Return what the dialog says of photographs, first reasons that their cards leave out."""
+    shared = dict[str, str]()
+    for model in report.models:
+        doubts = {**model.unsure, **model.doubtful}
+        for name, reasons in doubts.items():
+            if not _own_reason(name, doubts):
+                shared[name] = text_of(reasons)
+    found = []
+    for name in names:
+        facts = facts_of(photographs[name], report.lines.get(name))
+        if name in shared:
+            facts.insert(0, ("Why not surer", shared[name]))
+        found.append(facts)
+    return found
+
+
+def _neighbours(
+    report: RunReport,
+    photographs: Mapping[str, PhotographReport],
+    names: Sequence[str],
+) -> list[list[tuple[int, int, str]]]:
+    """Return which photographs share most with each: their numbers, how many, and of what."""
+    index = {name: number for number, name in enumerate(names)}
+    found = []
+    for name in names:
+        shared = photographs[name].neighbours
+        kind = "points"
+        if not shared and name in report.unregistered:
+            shared = report.unregistered[name].partners
+            kind = "inliers"
+        rows = []
+        for other, num in shared.items():
+            if other in index:
+                rows.append((index[other], num, kind))
+        found.append(rows)
+    return found
 
 
 def _known_photographs(
@@ -148,21 +193,25 @@ def _content(
 ) -> dict[str, Any]:
     """Return the variables of the template."""
     names = content.names
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    model = largest_of(report.models)
     verdict = verdict_of(report, names, photographs)
     return {
         "report": report,
         "model": model,
         "verdict": verdict,
+        "tool_of": tool_of,
         "qualities": QUALITIES,
         "signs": SIGNS,
         "photographs": [(name, photographs[name]) for name in names[:MAX_NUM_CAMERAS]],
         "contradictions": [
             contradiction_text(one) for one in report.focal_contradictions
         ],
-        "doubts": _doubts(report, model),
+        "why_no_model": _why_no_model(report),
+        "reasons": groups_of(names, report.models, report.unregistered),
+        "after_next_run": _command_to_compare(report.output_path),
         "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
         "max_num_lines": MAX_LINES,
+        "max_num_named": MAX_NUM_NAMED,
         "cards": [_card(name, report, photographs[name]) for name in names],
         "pairs_to_check": content.pairs_to_check,
         "marks_command": content.marks_command,
@@ -183,10 +232,11 @@ def _views(workspace: Workspace, report: RunReport) -> list[View3D]:
     """Read the largest models, with the classes of their photographs as colours."""
     views = []
     shown = report.models[:MAX_NUM_MODELS]
+    most = max_num_observations(report.images_total) // max(1, len(shown))
     for number, model in enumerate(shown):
         kinds = {name: quality_of(name, model) for name in model.registered_names}
         path = workspace.sparse / str(number)
-        views.append(read_view(path, kinds, MAX_NUM_OBSERVATIONS // len(shown)))
+        views.append(read_view(path, kinds, most))
     return views
 
 
@@ -228,14 +278,20 @@ def _own_reason(name: str, doubts: Mapping[str, tuple[Doubt, ...]]) -> str:
     return text_of(reasons) if list(doubts.values()).count(reasons) == 1 else ""
 
 
-def _doubts(report: RunReport, model: ModelSummary) -> list[str]:
-    """Return what cannot be trusted, or why there is no model and what became of photographs."""
+def _why_no_model(report: RunReport) -> list[str]:
+    """Return why there is no model, and what became of photographs; nothing where there is one."""
     if report.models:
-        unsure = [f"not sure: {line}" for line in by_story(texts_of(model.unsure))]
-        return by_story(texts_of(model.doubtful)) + unsure
+        return []
     why = report.why_no_model
     fates = {name: why.fate() for name, why in report.unregistered.items()}
     return [f"{why[0].upper()}{why[1:]}.", *by_story(fates)]
+
+
+def _command_to_compare(output_path: Path) -> str:
+    """Return the command that lays this run and a next one over each other."""
+    this_path = output_path.absolute()  # "." has no name
+    next_path = this_path.with_name(f"{this_path.name}-2")
+    return shlex.join(["colmap-affrect", "show-runs", str(this_path), str(next_path)])
 
 
 def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:
@@ -258,7 +314,7 @@ def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:
 
 def _tools(report: RunReport, content: RunContent) -> dict[str, Any]:
     """Return what the tools for tie points and masks begin with."""
-    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    model = largest_of(report.models)
     names = content.names
     index = {name: number for number, name in enumerate(names)}
     errors_px = {(one.point, one.image): one.error_px for one in model.tie_points}

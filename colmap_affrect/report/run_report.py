@@ -21,10 +21,10 @@ from colmap_affrect.project.line_report import LineReport, line_report
 from colmap_affrect.project.reasons import text_of
 from colmap_affrect.project.report import (
     MAX_LINES,
-    NO_MODEL,
     SOURCES,
     ModelSummary,
     ReconstructionReport,
+    largest_of,
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.photographs import PhotographReport, quality_of
@@ -121,7 +121,7 @@ class RunReport(ReconstructionReport):
     def _photographs(self) -> str:
         """Return a folded table of the photographs and what became of each."""
         rows = []
-        model = self.models[0] if self.models else NO_MODEL
+        model = largest_of(self.models)
         for name in self.registered_names:
             chance = model.probabilities.get(name)
             percent = "" if chance is None else f"{chance:.0%}"
@@ -153,9 +153,8 @@ class RunReport(ReconstructionReport):
         if page is None:
             return f"Results: <code>{_text(str(self.output_path))}</code>"
         relative = os.path.relpath(page)
-        if relative.startswith(
-            os.pardir
-        ):  # notebooks show files below their folder only
+        # Notebooks show files below their folder only
+        if relative.startswith(os.pardir):
             return f"To look at: <code>{_text(str(page))}</code>"
         address = escape(Path(relative).as_posix(), quote=True)
         return f'To look at: <a href="{address}" target="_blank">{_text(relative)}</a>'

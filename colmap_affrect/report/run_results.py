@@ -6,7 +6,7 @@ from typing import Any
 
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import num_matched_pairs
-from colmap_affrect.escalation.escalate import matched_again
+from colmap_affrect.escalation.escalate import escalation_summary
 from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.pairs.lists import Pair
@@ -71,7 +71,8 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     if not workspace.is_foreign:
         stored_lines = context.features.lines_of(result.names)
     lines = lines_of_report(context.features, stored_lines)
-    again = matched_again(context)
+    escalated = escalation_summary(context)
+    escalates = escalated.matched_again or escalated.untried
     report = RunReport(
         output_path=workspace.path,
         images_total=len(result.names),
@@ -95,13 +96,13 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
             missing,
             result.models,
             max(pair_inliers.values(), default=0),
-            again.untried,
-            again.effort,
+            escalated.untried,
+            escalated.effort,
         ),
         by_hand=by_hand.texts(),
-        effort=again.effort if again.tried or again.untried else "",
-        matched_again=again.tried,
-        untried=again.untried,
+        effort=escalated.effort if escalates else "",
+        matched_again=escalated.matched_again,
+        untried=escalated.untried,
         **_own_results(context),
     )
     workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report

@@ -17,9 +17,12 @@ from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.upright import upright_of_run
 
 # What is in the view, and how it is drawn, was chosen by eye.
-MAX_NUM_POINTS = 20_000  # that are drawn of a model; a page stays below some MB
-# Of them in photographs, 6 bytes each; of points beyond that the page does not tell who sees them
-MAX_NUM_OBSERVATIONS = 50_000
+# That are drawn of a model of few photographs, 9 bytes each, and of many; resource
+MAX_NUM_POINTS = 20_000
+MAX_NUM_POINTS_OF_MANY = 200_000
+NUM_POINTS_OF_PHOTOGRAPH = 500  # with which the page of a larger model grows; resource
+# Of a point that is drawn, 6 bytes each; of points beyond that the page does not tell who sees them
+OBSERVATIONS_PER_POINT = 2.5
 NUM_GRID = 12  # rows and columns of places that radial distortion is fitted to
 # Share of the points, by distance from their median, that is in the view
 POINT_PERCENTILE = 90.0
@@ -43,20 +46,17 @@ class View3D:
     """A model ready for the page; lengths in units of the radius of the view."""
 
     num_points: int = 0
-    points: str = (
-        ""  # base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
-    )
-    cameras: tuple[
-        tuple[str, Array], ...
-    ] = ()  # names; (5, 3) centre and corners of pyramids
+    # Base64: (N, 3) uint16 positions from -1 to 1, then (N, 3) uint8 colours
+    points: str = ""
+    # Names; (5, 3) centre and corners of pyramids
+    cameras: tuple[tuple[str, Array], ...] = ()
     # Base64: (N,) uint16 numbers of observations, then their (K,) uint16 rows of ``cameras``, then
     # (K, 2) uint16 places, 65535 at the right and lower border of the photograph
     tracks: str = ""
     looks: tuple[dict[str, Any], ...] = ()  # how each camera sees, for the script
     note: str = ""  # why there is nothing to draw; empty if there is
-    kinds: Mapping[str, str] = field(
-        default_factory=dict
-    )  # colours of cameras, by photograph
+    # Colours of cameras, by photograph
+    kinds: Mapping[str, str] = field(default_factory=dict)
 
     def script_data(self, index: Mapping[str, int]) -> dict[str, Any]:
         """Return what the script of the page reads, as JSON has it.
@@ -79,6 +79,17 @@ class View3D:
             "tracks": self.tracks,
             "cameras": cameras,
         }
+
+
+def max_num_points(num_photographs: int) -> int:
+    """Return how many points are drawn of a model of some photographs at most."""
+    wanted = NUM_POINTS_OF_PHOTOGRAPH * num_photographs
+    return min(max(wanted, MAX_NUM_POINTS), MAX_NUM_POINTS_OF_MANY)
+
+
+def max_num_observations(num_photographs: int) -> int:
+    """Return of how many observations a page of some photographs tells at most."""
+    return round(OBSERVATIONS_PER_POINT * max_num_points(num_photographs))
 
 
 def read_view(
@@ -157,8 +168,9 @@ def view_of(model: pycolmap.Reconstruction, max_num_observations: int = 0) -> Vi
         max_num_observations: see :func:`read_view`.
     """
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    if len(ids) > MAX_NUM_POINTS:
-        ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)
+    most = max_num_points(model.num_reg_images())
+    if len(ids) > most:
+        ids = np.random.default_rng(0).choice(ids, most, replace=False)
     chosen = [model.points3D[point_id] for point_id in ids.tolist()]
     positions = np.array([point.xyz for point in chosen]).reshape(-1, 3)
     colors = np.array([point.color for point in chosen], dtype=np.uint8).reshape(-1, 3)

@@ -48,9 +48,8 @@ def upright_of_run(model_path: Path, model: pycolmap.Reconstruction) -> Upright 
     if not workspace.features.exists():
         return None
     try:
-        if " " in workspace.input_digest(
-            "map"
-        ):  # it extends another model, whose frame it keeps
+        # A model that extends another one keeps the frame of that
+        if " " in workspace.input_digest("map"):
             return None
         return _upright(model, FeatureStore(workspace.features))
     except AffrectError as error:

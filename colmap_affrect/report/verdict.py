@@ -1,5 +1,6 @@
 """How good a run is, said first: a headline, a sentence what to do next, the models."""
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,15 +21,18 @@ SIGNS: Mapping[Quality, str] = {
 """What stands for a class beside its colour."""
 
 
+TOOLS = {"--tie-points": "tie-points", "--mask-path": "masks"}
+"""Sections of the page in which one makes what an option takes."""
+
+
 @dataclass(frozen=True)
 class Component:
     """A model, or the photographs that are in none."""
 
     title: str
     photographs: tuple[int, ...]  # their numbers, from 0
-    counts: Mapping[
-        Quality, int
-    ]  # of its photographs by class, without classes of none
+    # Of its photographs by class, without classes of none
+    counts: Mapping[Quality, int]
     view: int | None  # number of the model
 
 
@@ -67,6 +71,13 @@ def verdict_of(
         counts=counts,
         components=_components(names, photographs),
     )
+
+
+def tool_of(command: str) -> str:
+    """Return the section of the page whose tool makes what a command takes; empty: none does."""
+    words = shlex.split(command)
+    sections = [section for option, section in TOOLS.items() if option in words]
+    return sections[0] if sections else ""
 
 
 def _counts(photographs: Sequence[PhotographReport]) -> dict[Quality, int]:

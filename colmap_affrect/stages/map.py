@@ -117,14 +117,13 @@ def _task(
     if by_hand.masks_path:  # pairs that lost matches have no geometry any more
         sizes_px = None if copied else extracted_px(context)
         verify(path, context.verification, sizes_px)
+    unmeasured = [] if copied else unmeasured_pairs(context)
     return MappingTask(
-        path,
-        workspace.photographs(),
-        read_existing(extend, path) if extend else None,
-        before,
-        unmeasured_pairs=frozenset()
-        if copied
-        else frozenset(unmeasured_pairs(context)),
+        database_path=path,
+        image_path=workspace.photographs(),
+        extend=read_existing(extend, path) if extend else None,
+        previous_models=before,
+        unmeasured_pairs=frozenset(unmeasured),
         cameras=read_camera_records(workspace.cameras),
         lines={} if copied else line_cameras(context),
         may_share=not copied and context.inputs.may_share,
@@ -180,17 +179,23 @@ def agreements(
     """
     with verified.open_to_read() as database:
         graph = PairGraph.of(database, 1)
-    ids = {
-        name: image_id for image_id, name in graph.names.items()
-    }  # the model may have others
-    same = {
-        i: ids[image.name] for i, image in model.images.items() if image.name in ids
-    }
-    poses = {same[i]: pose for i, pose in poses_of(model).items() if i in same}
-    cameras = {same[i]: camera for i, camera in cameras_of(model).items() if i in same}
-    pairs = graph.pairs_inside(poses)
-    shares = {pair.ids: graph.agreement(pair, poses, cameras) for pair in pairs}
-    return {(graph.names[one], graph.names[two]): n for (one, two), n in shares.items()}
+    # The model may have other ids than the database.
+    model_ids = {image.name: image_id for image_id, image in model.images.items()}
+    model_poses = poses_of(model)
+    model_cameras = cameras_of(model)
+    poses = {}
+    cameras = {}
+    for image_id, name in graph.names.items():
+        model_id = model_ids.get(name)
+        if model_id in model_poses:
+            poses[image_id] = model_poses[model_id]
+            cameras[image_id] = model_cameras[model_id]
+    found = dict[Pair, float]()
+    for pair in graph.pairs_inside(poses):
+        first, second = pair.ids
+        names = (graph.names[first], graph.names[second])
+        found[names] = graph.agreement(pair, poses, cameras)
+    return found
 
 
 def image_names(context: Context) -> list[str]:

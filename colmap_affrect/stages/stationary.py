@@ -90,6 +90,15 @@ class _Votes:
         return places & is_most & has_enough
 
 
+@dataclass(frozen=True)
+class _MatchedCells:
+    """Where M matches of a pair of photographs of one size are, and which of them move."""
+
+    are_still: Mask  # (M,) move next to nothing
+    first: Indices  # (M, 2) cells, column and row, in the first photograph
+    second: Indices  # (M, 2) cells in the second one
+
+
 class StationaryFilter:
     """Drops the matches of pairs that lie where nothing moves.
 
@@ -141,25 +150,25 @@ class StationaryFilter:
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
             return np.ones(len(indices), bool)
-        still, first, second = self._still(names, indices, size)
+        matched = self._matched_cells(names, indices, size)
         places = self._places[size]
         near = grow_mask(places, 1)
-        both = near if near.mean() <= MAX_SHARE_BESIDE else places
-        if both.mean() > MAX_SHARE_BESIDE:
-            both = np.zeros_like(places)
-        dropped = still & _at(near, first) | _at(both, first) & _at(both, second)
-        of_background = self._of_background(names, first, second)
-        at_rest = still & of_background
-        if np.count_nonzero(at_rest) > np.count_nonzero(of_background & ~still):
+        begins_near = _at(near, matched.first)
+        dropped = matched.are_still & begins_near
+        dropped |= _goes_between(matched, places, near)
+        of_background = self._of_background(names, matched)
+        num_at_rest = np.count_nonzero(of_background & matched.are_still)
+        num_moving = np.count_nonzero(of_background & ~matched.are_still)
+        if num_at_rest > num_moving:
             dropped |= of_background
             if size in self._of_still_cameras:
                 dropped |= self._motions(names, indices) <= _tolerance_px(size)
         return ~dropped
 
-    def _of_background(self, names: Pair, first: Indices, second: Indices) -> Mask:
+    def _of_background(self, names: Pair, matched: _MatchedCells) -> Mask:
         """Return which matches have an end where its photograph shows what stands still."""
-        found = np.zeros(len(first), bool)
-        for name, cells in zip(names, (first, second), strict=True):
+        found = np.zeros(len(matched.first), bool)
+        for name, cells in zip(names, (matched.first, matched.second), strict=True):
             background = self._backgrounds.get(name)
             if background is not None:
                 found |= _at(background, cells)
@@ -209,10 +218,11 @@ class StationaryFilter:
         of_sizes = [pair for pair in pairs if self._common_size(pair) in self._places]
         for found in self._matches.read(of_sizes):
             size = self._sizes[found.names[0]]
-            are_still, first, second = self._still(found.names, found.indices, size)
-            for name, cells in zip(found.names, (first, second), strict=True):
-                votes[name].still[:] += _counts(cells[are_still])
-                votes[name].moving[:] += _counts(cells[~are_still])
+            matched = self._matched_cells(found.names, found.indices, size)
+            both = (matched.first, matched.second)
+            for name, cells in zip(found.names, both, strict=True):
+                votes[name].still[:] += _counts(cells[matched.are_still])
+                votes[name].moving[:] += _counts(cells[~matched.are_still])
         for name, of_image in votes.items():
             background = of_image.background(self._places[self._sizes[name]])
             if background.any():
@@ -243,23 +253,25 @@ class StationaryFilter:
             num_images[size] += 1
         cells = NUM_CELLS, NUM_CELLS
         # By size and cell: numbers of pairs with a match, and with one that does not move; images.
-        matched: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
-        still: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
+        num_matched: dict[Size, Indices] = defaultdict(
+            lambda: np.zeros(cells, np.int64)
+        )
+        num_still: dict[Size, Indices] = defaultdict(lambda: np.zeros(cells, np.int64))
         images = dict[Size, Mask]()
         for found in self._matches.read(list(filter(self._common_size, pairs))):
             size = self._sizes[found.names[0]]
-            are_still, first, _ = self._still(found.names, found.indices, size)
-            matched[size] += _mask(first)
-            unmoved = _mask(first[are_still])
-            still[size] += unmoved
+            matched = self._matched_cells(found.names, found.indices, size)
+            num_matched[size] += _mask(matched.first)
+            unmoved = _mask(matched.first[matched.are_still])
+            num_still[size] += unmoved
             if size not in images:
                 images[size] = np.zeros((*cells, num_images[size]), bool)
             for name in found.names:
                 images[size][unmoved, numbers[name]] = True
         places = {}
-        for size, counts in matched.items():
-            likely = still[size] >= MIN_NUM_PAIRS
-            likely &= still[size] >= MIN_SHARE * counts
+        for size, counts in num_matched.items():
+            likely = num_still[size] >= MIN_NUM_PAIRS
+            likely &= num_still[size] >= MIN_SHARE * counts
             likely &= images[size].sum(2) >= MIN_NUM_IMAGES
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
@@ -280,41 +292,41 @@ class StationaryFilter:
         """
         limit_px = MAX_MOTION_FRAC * max(size)
         tolerance_px = _tolerance_px(size)
-        own, connected = np.zeros((2, NUM_CELLS, NUM_CELLS))
+        of_cells: Array = np.zeros((NUM_CELLS, NUM_CELLS))
+        of_regions: Array = np.zeros((NUM_CELLS, NUM_CELLS))
         for found in self._matches_of_size(pairs, size):
-            are_still, first, _ = self._still(found.names, found.indices, size)
-            cells = first[are_still]
+            matched = self._matched_cells(found.names, found.indices, size)
+            cells = matched.first[matched.are_still]
             if not _at(likely, cells).any():
                 continue
-            points, others = self._ends(found.names, found.indices[are_still])
+            still_indices = found.indices[matched.are_still]
+            points, others = self._ends(found.names, still_indices)
             ratios = stationary_log_ratios(
                 points,
                 motions=others - points,
                 tolerance_px=tolerance_px,
                 limit_px=limit_px,
             )
-            own += _means(cells, ratios)
-            connected += _means(
-                cells,
-                means_of_regions(
-                    cells, values=ratios, num_cells=NUM_CELLS, reach=CONNECTED
-                ),
+            of_cells += _means(cells, ratios)
+            connected = means_of_regions(
+                cells, values=ratios, num_cells=NUM_CELLS, reach=CONNECTED
             )
-        return np.minimum(own, connected)
+            of_regions += _means(cells, connected)
+        return np.minimum(of_cells, of_regions)
 
     def _moves_elsewhere(self, pairs: Sequence[Pair], size: Size, places: Mask) -> bool:
         """Tell whether enough matches of some pairs move together outside of places."""
         num_pairs = 0
         names = set[str]()
         for found in self._matches_of_size(pairs, size):
-            are_still, first, second = self._still(found.names, found.indices, size)
-            are_moving = ~(are_still | _at(places, first) | _at(places, second))
+            matched = self._matched_cells(found.names, found.indices, size)
+            in_places = _at(places, matched.first) | _at(places, matched.second)
+            are_moving = ~(matched.are_still | in_places)
             points, others = self._ends(found.names, found.indices[are_moving])
-            near_px = max(size) / NUM_CELLS
-            if (
-                num_moving_together(points, motions=others - points, radius_px=near_px)
-                >= MIN_MOVING
-            ):
+            num_together = num_moving_together(
+                points, motions=others - points, radius_px=max(size) / NUM_CELLS
+            )
+            if num_together >= MIN_MOVING:
                 num_pairs += 1
                 names.update(found.names)
         return num_pairs >= MIN_NUM_PAIRS and len(names) >= MIN_NUM_IMAGES
@@ -326,16 +338,16 @@ class StationaryFilter:
         of_size = [pair for pair in pairs if self._common_size(pair) == size]
         return self._matches.read(of_size)
 
-    def _still(
+    def _matched_cells(
         self, names: Pair, indices: Indices, size: Size
-    ) -> tuple[Mask, Indices, Indices]:
-        """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
+    ) -> _MatchedCells:
+        """Return where (M, 2) matches of photographs of one size are, and which of them move."""
         first, second = self._ends(names, indices)
         motions = self._motions(names, indices)
-        return (
-            motions <= MAX_MOTION_FRAC * max(size),
-            _cells(first, size),
-            _cells(second, size),
+        return _MatchedCells(
+            are_still=motions <= MAX_MOTION_FRAC * max(size),
+            first=_cells(first, size),
+            second=_cells(second, size),
         )
 
     def _motions(self, names: Pair, indices: Indices) -> Array:
@@ -352,6 +364,22 @@ class StationaryFilter:
     def _common_size(self, pair: Pair) -> Size | None:
         size = self._sizes[pair[0]]
         return size if size == self._sizes[pair[1]] else None
+
+
+def _goes_between(matched: _MatchedCells, places: Mask, near: Mask) -> Mask:
+    """Return which matches go from one place, or beside it, to another one; none of large places.
+
+    Args:
+        matched: The matches.
+        places: Cells where nothing moves.
+        near: These, and the cells beside them.
+    """
+    share_near = near.mean()
+    if share_near <= MAX_SHARE_BESIDE:
+        return _at(near, matched.first) & _at(near, matched.second)
+    if places.mean() <= MAX_SHARE_BESIDE:
+        return _at(places, matched.first) & _at(places, matched.second)
+    return np.zeros(len(matched.first), bool)
 
 
 def _tolerance_px(size: Size) -> float:

@@ -30,7 +30,7 @@ from whole_run import check_set, linked_photographs, read_set
 
 import colmap_affrect
 from colmap_affrect.escalation import policy
-from colmap_affrect.progress import FACTOR, Forecast
+from colmap_affrect.forecast import FACTOR, Forecast
 
 SHARES = (0.1, 0.25, 0.5)  # of a run, after which it is forecast
 HEADER = (
@@ -60,7 +60,7 @@ class Record:
     set: str
     num_images: int = 0
     num_pairs: int = 0
-    more: dict[str, int] = field(default_factory=dict)
+    more: dict[str, float] = field(default_factory=dict)
     events: list[tuple[float, float, str, list[str | float]]] = field(
         default_factory=list
     )
@@ -77,7 +77,7 @@ def record_run(name: str, image_path: Path, output_path: Path) -> Record:
     class Recorded(Forecast):
         """A forecast that notes what it is told."""
 
-        def __init__(self, num_images: int, num_pairs: int, **more: int) -> None:
+        def __init__(self, num_images: int, num_pairs: int, **more: float) -> None:
             super().__init__(num_images, num_pairs, **more)
             record.num_images = num_images
             record.num_pairs = num_pairs
@@ -135,9 +135,9 @@ def forecasts_of(record: Record, times_s: Sequence[float]) -> dict[float, float 
         while events and events[0][1] <= time_s:
             _, clock.now_s, method, arguments = events.pop(0)
             if method == "made":
-                forecast = Forecast(
-                    record.num_images, record.num_pairs, clock, **record.more
-                )
+                # By the clock of the processor one core works
+                more = {**record.more, "num_cores": 1}
+                forecast = Forecast(record.num_images, record.num_pairs, clock, **more)
             else:
                 getattr(forecast, method)(*arguments)
         clock.now_s = time_s

@@ -27,9 +27,9 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pair_lines import (
-    MAX_NUM_LINES,
-    MIN_NUM_LINES_OF_PAIR,
+    MAX_NUM_PAIRS,
     PairLines,
+    num_lines_of_pair,
 )
 from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.pictures import base64_text
@@ -43,7 +43,8 @@ from browser import Browser, chromium, until_drawn
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "sample_scenes" / "courtyard_historical" / "images"
 IMAGE_SIZE = (640, 480)
-NUM_POINTS = 30_000  # more than a page draws
+NUM_POINTS = 250_000  # more than a page draws
+NUM_SEEN_POINTS = 600  # of them, by all photographs: more than a page tells of
 NUM_NEIGHBOURS = 40  # photographs that each one is verified with
 NUM_OPENINGS = 3
 WIDTH = 1400
@@ -73,7 +74,7 @@ def make_model(names: Sequence[str]) -> pycolmap.Reconstruction:
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs = 1
     options.num_frames_per_rig = len(names)
-    options.num_points3D = 200
+    options.num_points3D = NUM_SEEN_POINTS
     options.camera_width, options.camera_height = IMAGE_SIZE
     pycolmap.set_random_seed(0)
     model = pycolmap.synthesize_dataset(options)
@@ -131,12 +132,12 @@ def make_page(num_images: int, folder: Path) -> Path:
 
 def made_up_lines(num_images: int) -> PairLines:
     """Return as many lines of pairs as a page takes."""
-    num_pairs = MAX_NUM_LINES // MIN_NUM_LINES_OF_PAIR
+    num_lines = num_lines_of_pair(MAX_NUM_PAIRS)
     pairs = []
-    for number in range(num_pairs):
+    for number in range(MAX_NUM_PAIRS):
         first = number % (num_images - 1)
-        pairs.append((first, first + 1, MIN_NUM_LINES_OF_PAIR, "made up"))
-    data = np.random.default_rng(0).bytes(9 * MAX_NUM_LINES)
+        pairs.append((first, first + 1, num_lines, "made up"))
+    data = np.random.default_rng(0).bytes(9 * num_lines * MAX_NUM_PAIRS)
     return PairLines(pairs, base64_text(data))
 
 

@@ -220,6 +220,37 @@ def test_native_code_that_ends_the_command_is_named() -> None:
     )
 
 
+def run_as_command(main: str) -> tuple[str, str, float]:
+    """Run Python code as the command line; return what it prints, and how long it took."""
+    code = "import atexit, ctypes, time\nfrom colmap_affrect import __main__, cli, process\n"
+    code += f"process.QUIET_S = 0.2\nprocess.TICK_S = 0.05\ncli.main = {main}\n"
+    begin_s = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}__main__.main()"],
+        capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
+    )  # fmt: skip
+    return done.stdout, done.stderr, time.monotonic() - begin_s
+
+
+def test_loading_is_told_while_native_code_holds_the_lock_of_python() -> None:
+    loads = "ctypes.PyDLL(None).usleep(600_000)"
+    _, before, _ = run_as_command(f"lambda begin: ({loads}, begin(), 0)[-1]")
+    assert before.startswith("loading: at work for ")
+    assert "loading: done in " in before
+    _, quiet, _ = run_as_command("lambda begin: (begin(), time.sleep(0.6), 0)[-1]")
+    assert quiet.count("at work") <= 2  # at most of what was before the beginning
+
+
+def test_a_command_ends_without_taking_apart_what_is_loaded() -> None:
+    ends = "atexit.register(print, 'tidied up')"
+    slow = "setattr(cli, 'slow', type('Slow', (), {'__del__': lambda _: time.sleep(20)})())"
+    printed, _, wall_s = run_as_command(
+        f"lambda begin: (begin(), {ends}, {slow}, 0)[-1]"
+    )
+    assert printed == "tidied up\n"
+    assert wall_s < 15.0
+
+
 def test_want_of_memory_while_packages_are_loaded_is_one_line() -> None:
     code = (
         "import sys, types\nfrom colmap_affrect import __main__\n"

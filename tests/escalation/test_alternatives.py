@@ -32,7 +32,7 @@ from colmap_affrect.escalation.alternatives import (
     remove_alternatives,
     restore_best,
 )
-from colmap_affrect.escalation.escalate import Escalation, begin, matched_again
+from colmap_affrect.escalation.escalate import Escalation, begin, escalation_summary
 from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers.base import MAPPERS, Mapper
@@ -77,7 +77,7 @@ def matched(
     workspace = verified(
         photos, tmp_path_factory.mktemp("matched") / "out", recipe.name
     )
-    escalation, _ = begin(Context(workspace), recipe.escalate)
+    escalation = begin(Context(workspace), recipe.escalate)
     escalation.matches.update_state(
         learned_matching=Begun(1, tuple(escalation.state.pairs))
     )
@@ -476,9 +476,9 @@ def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
     ) == before
     assert (workspace.sparse / "0" / "images.bin").stat().st_mtime_ns == model
     assert not workspace.best.exists()
-    done = matched_again(context)
+    done = escalation_summary(context)
     assert done.effort == "normal"
-    assert [(one.kind, one.num_pairs) for one in done.tried] == [("learned", 6)]
+    assert [(one.kind, one.num_pairs) for one in done.matched_again] == [("learned", 6)]
 
 
 @pytest.mark.long

@@ -21,9 +21,9 @@ from colmap_affrect.escalation.policy import (
     Situation,
     is_hopeful,
     learned_step,
+    matched_by_level,
     next_step,
-    tried,
-    untried,
+    untried_by_level,
 )
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.recipes import load_recipe
@@ -235,7 +235,7 @@ def test_little_hope_ends_it_but_while_nothing_is_registered(
 ) -> None:
     monkeypatch.setattr(policy, "MIN_PHOTOGRAPHS", 100.0)
     assert not next_step(done_with_learned(), "high").step.pairs
-    assert not untried(done_with_learned())
+    assert not untried_by_level(done_with_learned())
     nothing = done_with_learned(weights=NAMES)
     assert not nothing.registered
     assert next_step(nothing, "normal").step.pairs
@@ -249,10 +249,10 @@ def test_images_that_measured_frames_hold_get_no_learned_warps() -> None:
 
 def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
     after = done_with_learned()
-    (one,) = tried(after)
+    (one,) = matched_by_level(after)
     assert (one.kind, one.num_pairs) == ("learned", 10)
     assert one.core_s == pytest.approx(after.seconds_spent_at(LEARNED))
-    kinds = {one.kind: one for one in untried(after)}
+    kinds = {one.kind: one for one in untried_by_level(after)}
     assert "learned" not in kinds
     assert kinds["measured, all tilts"].num_pairs == 7
     assert kinds["measured, all tilts"].core_s > 0.0

@@ -24,9 +24,9 @@ from colmap_affrect.mappers.camera_priors import (
     Measurement,
     camera_prior,
     camera_priors,
+    combined,
     focal_contradictions,
     measurement_of_lines,
-    product,
     usual_principal_point,
 )
 
@@ -52,7 +52,7 @@ def by_lines(
 
 def test_log_normals_multiply_by_their_precisions() -> None:
     measured = Measurement(LogNormal(2.0, 0.2), 1e-12)
-    found = product(USUAL, [measured])
+    found = combined(USUAL, [measured])
     precision = USUAL_SIGMA**-2 + 0.2**-2
     mean = (
         math.log(USUAL_FOCAL) * USUAL_SIGMA**-2 + math.log(2.0) * 0.2**-2
@@ -64,10 +64,10 @@ def test_log_normals_multiply_by_their_precisions() -> None:
 def test_one_of_three_measurements_that_is_far_from_the_others_hardly_counts() -> None:
     near = Measurement(LogNormal(1.0, 0.06), 0.1)
     far = Measurement(LogNormal(2.5, 0.06), 0.1)
-    assert product(USUAL, [near, near, far]).focal == pytest.approx(1.0, rel=0.06)
-    alone = product(USUAL, [near, far])  # the one that is the more usual is likelier
+    assert combined(USUAL, [near, near, far]).focal == pytest.approx(1.0, rel=0.06)
+    alone = combined(USUAL, [near, far])  # the one that is the more usual is likelier
     assert alone.focal == pytest.approx(1.0, rel=0.06)
-    assert alone.sigma > 1.5 * product(USUAL, [near]).sigma
+    assert alone.sigma > 1.5 * combined(USUAL, [near]).sigma
 
 
 def test_what_is_usual_is_divided_out_of_what_lines_say() -> None:

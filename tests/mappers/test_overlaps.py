@@ -145,7 +145,7 @@ def test_an_eighth_of_a_photograph_tells_whether_two_are_of_one_place(
     num_expected: float, *, tells: bool
 ) -> None:
     missing = Overlap(num_expected, 0.0)
-    assert missing.tells == tells
+    assert missing.has_enough == tells
     assert (missing.log_ratio < CONTRADICTED) == tells
     assert (Overlap(num_expected, num_expected).log_ratio > 1.0) == tells
 

@@ -19,7 +19,7 @@ from colmap_affrect.mappers import pair_graph
 from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     VerifiedPair,
-    _strongest,
+    _split_by_strength,
     cameras_of,
     compared_with_pose,
     poses_of,
@@ -235,7 +235,7 @@ def test_a_pair_scores_models_that_is_among_the_strongest_of_one_of_its_images()
     matches = np.zeros((20, 2), np.int64)
     geometry = pycolmap.TwoViewGeometry()
     star = [VerifiedPair((1, leaf), matches, geometry) for leaf in range(2, 22)]
-    strong, weak = _strongest(star)
+    strong, weak = _split_by_strength(star)
     assert len(strong) == 20
     assert not weak
 

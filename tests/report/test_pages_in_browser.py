@@ -164,6 +164,25 @@ def test_the_dialog_has_the_figures_of_a_photograph(browser: Browser) -> None:
     assert browser.run(SELECTED) == "1"
 
 
+def test_the_dialog_leads_to_what_two_share_and_to_the_tools(browser: Browser) -> None:
+    browser.click("header [data-open='1']")
+    browser.click("#photo [data-pair]")
+    assert not browser.run(DIALOG)
+    title = browser.run("return document.querySelector('#pair strong').textContent")
+    assert title.startswith("2 b")
+    browser.click("header [data-open='2']")
+    said = browser.run("return document.getElementById('photo').innerText")
+    assert said.count("few matches support its position") == 1
+    browser.click("#photo [data-mark]")
+    lists = """return [...document.querySelectorAll('#tie-points figure select')]
+        .map((list) => list.value)"""
+    assert browser.run(lists)[0] == "2"
+    browser.click("header [data-open='4']")
+    browser.click("#photo [data-mask]")
+    masked = "return document.querySelector('#masks [data-part=photo]').value"
+    assert browser.run(masked) == "4"
+
+
 def test_a_click_into_the_matrix_draws_the_pair(browser: Browser) -> None:
     assert browser.run("return document.getElementById('pair').hidden")
     place = browser.run("""const matrix = document.querySelector("[data-matrix]");
@@ -301,7 +320,7 @@ def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
     browser.command("Emulation.setEmulatedMedia", media="print")
     sides = "return [...document.querySelectorAll('#model .sides img')].map((i) => i.naturalWidth)"
     assert browser.run(sides) == [600] * 3
-    found = "[...document.querySelectorAll('button:not(.photo, .chip)')]"
+    found = "[...document.querySelectorAll('button:not(.photo, .chip, .ref)')]"
     buttons = f"return {found}.map((b) => b.offsetWidth)"
     assert set(browser.run(buttons)) == {0}
     browser.command("Emulation.setEmulatedMedia", media="")

@@ -29,6 +29,7 @@ from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
+from colmap_affrect.report.pair_lines import MAX_NUM_PAIRS, num_lines_of_pair
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
@@ -328,3 +329,11 @@ def test_a_pair_of_long_names_and_of_a_read_only_folder_is_drawn(
     monkeypatch.setattr(FileLock, "acquire", fail)
     pairs.draw_pair(out, names, photos, tmp_path / "pair.png")
     assert (tmp_path / "pair.png").is_file()
+
+
+def test_a_page_draws_each_pair_and_fewer_lines_of_each_where_there_are_many() -> None:
+    """All pairs of 40 photographs fit into the page as it was; more make it grow."""
+    assert num_lines_of_pair(0) == num_lines_of_pair(10) == 120
+    assert num_lines_of_pair(780) == 30
+    assert num_lines_of_pair(MAX_NUM_PAIRS) == 20
+    assert MAX_NUM_PAIRS >= 100 * 99 / 2

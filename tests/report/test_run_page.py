@@ -7,6 +7,7 @@ import hashlib
 import html as markup
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.reasons import Missing
+from colmap_affrect.project.report import Advice
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
@@ -37,7 +39,8 @@ def test_everything_of_the_report_is_told(html: str) -> None:
         "<title>2 of 6 photographs are placed surely, 1 unsure, 1 doubtful, 2 not placed</title>",
         "Next: one camera.", "sparse/0: 4 photographs", "Not placed: 2",
         "sure: 95% probable", "unsure: 70% probable; bridged by &lt;img src=x",
-        "d.png: may be a mirrored copy of &lt;b&gt;.jpg",
+        "may be a mirrored copy of &lt;b&gt;.jpg",
+        "Why photographs are not sure, or not placed", "colmap-affrect show-runs ",
         "doubtful: 40% probable; may be a mirrored",
         ">colmap-affrect run --output-path out-2<", "no verified pair",
         "unreadable: f.png: not a readable image",
@@ -71,7 +74,7 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
         base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         for script in re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     ]
-    assert len(digests) == 6
+    assert len(digests) == 7
     allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
     assert markup.unescape(policy) == (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
@@ -152,6 +155,37 @@ def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
     names = [f"{number}.png" for number in range(num_photographs)]
     assert list(pictures.thumbnails(tmp_path, names)) == names
     assert set(asked) == {side_px}
+
+
+def test_advice_leads_to_the_tool_that_makes_what_its_command_takes(
+    folder: Path, html: str, tmp_path: Path
+) -> None:
+    assert "data-tool" not in html.split("</header>")[0]
+    cameras = ViewGraph(Workspace(folder / "out").database).cameras
+    advised = (
+        Advice("mark six points", "colmap-affrect run --tie-points marks.csv"),
+        Advice("mask captions", "colmap-affrect run --mask-path masks"),
+        Advice("more photographs"),
+    )
+    report = replace(small_report(tmp_path), advice=advised)
+    page = write_run_page(
+        Workspace(tmp_path), report, RunContent(NAMES, {}, cameras=cameras)
+    )
+    head = page.read_text(encoding="utf-8").split("<main>")[0]
+    assert re.findall('data-tool="([^"]*)"', head) == [
+        "tie-points", "tie-points", "masks",
+    ]  # fmt: skip
+
+
+def test_what_lost_photographs_matched_is_told_as_their_neighbours(
+    folder: Path, tmp_path: Path
+) -> None:
+    values = {"unregistered": {NAMES[4]: Missing("not_registered", 0, {NAMES[1]: 31})}}
+    report = replace(small_report(folder / "out"), **values)
+    page = write_run_page(Workspace(tmp_path), report, RunContent(NAMES, {}))
+    text = page.read_text(encoding="utf-8")
+    data = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert data["neighbours"][4] == [[1, 31, "inliers"]]
 
 
 def test_a_run_without_anything_says_so(tmp_path: Path) -> None:

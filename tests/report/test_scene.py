@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.report.scene import View3D, read_view
+from colmap_affrect.report.scene import (
+    View3D,
+    max_num_observations,
+    max_num_points,
+    read_view,
+)
 
 FOCAL_PX = 100.0
 SIZE = (200, 120)  # half of it is 1.0 and 0.6 focal lengths
@@ -114,3 +119,10 @@ def test_colors_show_on_light_and_on_dark_ground(
     poses = [cam_from_world(0.0, (x, 0.0, 0.0)) for x in (-1.0, 1.0)]
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
     assert colors(view_of(tmp_path / "model", poses, points, color)) == {shown}
+
+
+def test_pages_of_many_photographs_draw_more_points() -> None:
+    assert [max_num_points(num) for num in (3, 40, 100, 1000)] == [
+        20_000, 20_000, 50_000, 200_000,
+    ]  # fmt: skip
+    assert [max_num_observations(num) for num in (40, 1000)] == [50_000, 500_000]

@@ -121,6 +121,26 @@ def test_two_marks_tell_where_the_point_is_in_the_others(browser: Browser) -> No
     assert max(residuals) < 2.0
 
 
+PIECES = """return [...document.querySelectorAll("#tie-points .strip .chip")]
+    .map((chip) => parseInt(chip.textContent) - 1)"""
+
+
+def test_all_other_photographs_show_where_the_point_should_be(browser: Browser) -> None:
+    """Lines after one mark, places after two; a click goes there."""
+    seen = track_of_four(browser.run(DATA))
+    mark(browser, 0, 0, seen[0])
+    assert set(browser.run(PIECES)) <= {1, 2, 3}
+    assert browser.run(PIECES)
+    mark(browser, 1, 1, seen[1])
+    assert browser.run(PIECES) == [2, 3]
+    browser.click("#tie-points .strip .chip")
+    browser.key(" ")
+    rows = browser.run(MARKS)
+    marked = np.array([float(cell) for cell in rows[2][2:4]])
+    assert np.linalg.norm(marked - seen[2]) < 3.0
+    assert browser.run(PIECES) == [3]
+
+
 def test_a_mark_at_a_wrong_place_has_a_large_residual_at_once(browser: Browser) -> None:
     seen = track_of_four(browser.run(DATA))
     for photo in (0, 1):

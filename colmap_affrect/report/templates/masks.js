@@ -261,7 +261,14 @@
     }
     return found;
   }
-  page.masks = { pictures };
+  page.masks = {
+    pictures,
+    open(index) {
+      section.querySelector("details").open = true;
+      choose(index);
+      section.scrollIntoView();
+    },
+  };
 
   list.append(...usable.map((index) => new Option(label(index), index)));
   list.addEventListener("change", () => choose(Number(list.value)));

@@ -30,7 +30,8 @@ const page = (() => {
   }
 
   const dialog = document.getElementById("photo");
-  const through = dialog.querySelector("[data-through]");
+  const [through, marks, covers] = ["through", "mark", "mask"].map((name) => dialog.querySelector(`[data-${name}]`));
+  const shares = dialog.querySelector(".shares");
   const shared = { looks: () => false, lookThrough: () => {} };
   let opened = 0;
   function open(index) {
@@ -46,10 +47,38 @@ const page = (() => {
       [["dt", title], ["dd", text]].map(([tag, words]) =>
         Object.assign(document.createElement(tag), { textContent: words })));
     dialog.querySelector(".facts").replaceChildren(...terms);
+    showShares(data.neighbours?.[opened] ?? []);
     through.hidden = !shared.looks(opened);
+    marks.hidden = !(shared.markIn && data.tie_points.photographs[opened]);
+    covers.hidden = !(shared.masks && data.tie_points.photographs[opened]);
     if (!dialog.open) dialog.showModal();
   }
+
+  // The photographs that it shares most with; a click shows what.
+  function showShares(others) {
+    shares.hidden = !(others.length && shared.showPair);
+    const buttons = others.map(([index, count, kind]) => {
+      const button = document.createElement("button");
+      Object.assign(button, { type: "button", textContent: `${label(index)}: ${count} ${kind}` });
+      button.dataset.pair = index;
+      return button;
+    });
+    shares.replaceChildren("Shares most with, click to see what: ", ...buttons);
+  }
+
   dialog.addEventListener("click", (event) => {
+    const other = event.target.closest("[data-pair]");
+    if (other) {
+      dialog.close();
+      shared.showPair(opened, Number(other.dataset.pair));
+      return;
+    }
+    if (event.target === marks || event.target === covers) {
+      dialog.close();
+      if (event.target === marks) shared.markIn(opened, data.neighbours[opened][0]?.[0]);
+      else shared.masks.open(opened);
+      return;
+    }
     const step = event.target.closest("button")?.dataset.step;
     if (event.target === through) {
       dialog.close();
@@ -78,6 +107,10 @@ const page = (() => {
     const large = event.target.closest(".enlarge, .panel > img");
     if (photograph) open(Number(photograph.dataset.open));
     else if (large) enlarge(large.closest(".panel"));
+  });
+  document.addEventListener("click", (event) => {
+    const { tool } = event.target.closest("[data-tool]")?.dataset ?? {};
+    if (tool) document.querySelector(`#${tool} details`).open = true;
   });
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && !dialog.open) all(".panel.large").forEach(enlarge);

@@ -453,6 +453,7 @@
     part("undo").disabled = !past.length;
     part("saved").hidden = true;
     panes.forEach((pane) => pane.draw());
+    page.tiePoints?.whenChanged?.();
   }
 
   // Files
@@ -522,10 +523,12 @@
     if (!isSaved && !isKept) event.preventDefault();
   });
 
-  // First a photograph that is not registered, beside one that is.
-  const lost = usable.find(isLost) ?? usable[0];
+  // First a photograph that is not in the largest model, beside one that is: what it matches best.
+  const isPlaced = (photo) => looks.get(photo)?.model === 0;
+  const lost = usable.find(isLost) ?? usable.find((photo) => !isPlaced(photo)) ?? usable[0];
   const others = usable.filter((photo) => photo !== lost);
-  const shown = [lost, others.find((photo) => !isLost(photo)) ?? others[0]];
+  const nearest = data.neighbours[lost].map(([photo]) => photo).filter((photo) => others.includes(photo));
+  const shown = [lost, [...nearest, ...others].find(isPlaced) ?? others[0]];
   const panes = [];
   section.querySelectorAll("figure").forEach((figure, index) => panes.push(new Pane(figure, shown[index])));
   const before = kept();
@@ -536,8 +539,18 @@
     say(`Marks from before: ${marks.length}. Undo goes back to those of the run.`);
   }
   show();
-  // For a server that maps again: marks as it takes them, and the residuals that it returns.
+  // For other scripts: where the current point should be; for a server that maps again: marks as it
+  // takes them, and the residuals that it returns.
   page.tiePoints = {
+    current: () => current,
+    isMarked: (photo) => Boolean(markOf(current, photo)),
+    expected: (photo) => expected(current, photo),
+    goTo(photo) {
+      panes[1].load(photo);
+      panes[1].seek();
+      panes[1].canvas.scrollIntoView({ block: "nearest" });
+      panes[1].canvas.focus({ preventScroll: true });
+    },
     rows: () => ordered().map(({ point, photo, x, y }) => [point, photographs[photo][0], x, y]),
     take(residuals) {
       const errors = new Map(residuals.map(([point, name, px]) => [JSON.stringify([point, name]), px]));

@@ -7,28 +7,41 @@
   const SIDES = { front: [0, FRONT], side: [Math.PI / 2, 0], top: [0, TOP] };
   const [NEAR_PX, DRAG_PX, MAX_LABELLED, MAX_PICTURES] = [16, 6, 80, 200];
   const [POINT_PX, ARROW_PX, CROP_PX, CROP_SHARE] = [9, 40, 120, 0.12];
+  const [MAX_WHILE_MOVING, REST_MS] = [60_000, 200]; // points that are drawn while a model is turned
   const [SEEN_COLOR, CHOSEN_COLOR] = [0xff00e0ff, "#ff2fd0"];
   const BEFORE_COLOR = [194, 87, 0];
   const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false, size: 1, fade: 0.8, after: 0.5 };
   let pointedAt = -1;
   let isWaiting = false;
+  let rest = 0; // timer, until which the model is being moved
 
   function turn(yaw, pitch) {
     eye.yaw += yaw;
     eye.pitch = limited(eye.pitch + pitch, -TOP, TOP);
     eye.isMoved = true;
+    moves();
     redraw();
   }
 
   function zoom(factor) {
     eye.zoom = limited(eye.zoom * factor, 0.3, MAX_ZOOM);
     eye.isMoved = true;
+    moves();
     redraw();
   }
 
   function look(pitch) {
     Object.assign(eye, { yaw: 0, pitch, zoom: 0, isMoved: false });
     redraw();
+  }
+
+  // Of many points some are enough while something moves; all follow at rest.
+  function moves() {
+    clearTimeout(rest);
+    rest = setTimeout(() => {
+      rest = 0;
+      redraw();
+    }, REST_MS);
   }
 
   function refit() {
@@ -401,7 +414,8 @@
       const usual = Math.max(1, Math.round(density * (width > 700 * density ? 2.2 : 1.6)));
       const { places, colors } = this;
       const seen = this.through?.seen;
-      for (let index = 0; index < 3 * this.count; index += 3) {
+      const step = rest ? Math.max(1, Math.ceil(this.count / MAX_WHILE_MOVING)) : 1;
+      for (let index = 0; index < 3 * this.count; index += 3 * step) {
         const [x, y, depth] = project(places[index], places[index + 1], places[index + 2]);
         const isSeen = seen?.[index / 3];
         const side = isSeen ? Math.round(1.6 * usual) : usual;

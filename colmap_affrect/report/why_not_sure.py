@@ -1,0 +1,93 @@
+"""Why photographs are not sure or not placed: each reason once, with its photographs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from colmap_affrect.project.reasons import SENTENCES, Doubt, Missing
+from colmap_affrect.project.report import ModelSummary
+
+Value = int | float | str
+
+
+@dataclass(frozen=True)
+class Group:
+    """A reason, and the photographs that it is true of."""
+
+    text: str
+    photographs: tuple[int, ...]  # their numbers, from 0
+
+
+@dataclass(frozen=True)
+class _Range:
+    """Values of one kind, which are told as the least and the greatest."""
+
+    values: Sequence[float]
+
+    def __format__(self, form: str) -> str:
+        """Return one number where the ends read alike, else both."""
+        least = format(min(self.values), form)
+        most = format(max(self.values), form)
+        return least if least == most else f"{least} to {most}"
+
+
+def groups_of(
+    names: Sequence[str],
+    models: Sequence[ModelSummary],
+    unregistered: Mapping[str, Missing],
+) -> list[Group]:
+    """Return why photographs are not sure or not placed.
+
+    Numbers that differ between photographs are told as a range: a reason for each degree by which a
+    rotation may be off would be as long as the list of the photographs.
+
+    Args:
+        names: of all photographs, in the order of their numbers.
+        models: the largest first.
+        unregistered: why photographs are not in the largest model.
+
+    Returns:
+        Reasons, those of most photographs first.
+    """
+    doubts = dict[str, Sequence[Doubt]]()
+    for model in models:
+        doubts |= {**model.unsure, **model.doubtful}
+    fates = dict[str, list[int]]()
+    by_kind = dict[tuple[Value, ...], list[tuple[int, Doubt]]]()
+    for number, name in enumerate(names):
+        missing = unregistered.get(name)
+        of_photograph = doubts.get(name, ())
+        if missing and not of_photograph:
+            of_photograph = missing.doubts
+        if missing and not of_photograph and not missing.model:
+            fates.setdefault(missing.fate(), []).append(number)
+        for doubt in of_photograph:
+            by_kind.setdefault(_kind(doubt), []).append((number, doubt))
+    found = []
+    for members in by_kind.values():
+        text = _text([doubt for _, doubt in members])
+        found.append(Group(text, tuple(number for number, _ in members)))
+    for fate, numbers in fates.items():
+        found.append(Group(fate, tuple(numbers)))
+    found.sort(key=lambda group: -len(group.photographs))
+    return found
+
+
+def _kind(doubt: Doubt) -> tuple[Value, ...]:
+    """Return what doubts share that are told together: the code, and all words."""
+    words = [value for value in doubt.values.values() if isinstance(value, str)]
+    return (doubt.code, *words)
+
+
+def _text(doubts: Sequence[Doubt]) -> str:
+    """Return a reason with the ranges of its numbers."""
+    values = dict[str, Value | _Range](doubts[0].values)
+    for key, value in doubts[0].values.items():
+        if isinstance(value, str):
+            continue
+        numbers = []
+        for doubt in doubts:
+            number = doubt.values[key]
+            if not isinstance(number, str):
+                numbers.append(number)
+        values[key] = _Range(numbers)
+    return SENTENCES[doubts[0].code].format(**values)
