@@ -25,6 +25,7 @@ from colmap_affrect.mappers.mapping import (
     model_folders,
     read_summaries,
 )
+from colmap_affrect.mappers.wrong_models import copy_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write, replace_text
 from colmap_affrect.project.match_state import LearnedModels, Worth
@@ -179,6 +180,7 @@ def _map_copy(context: Context, mapper: Mapper, choice: Choice, target: Path) ->
         map_images(other, mapper)
         for model_folder in model_folders(branch.sparse):
             model_folder.rename(target / model_folder.name)
+        copy_thrown_away(branch.sparse, target)
 
 
 # Going over to other models
@@ -221,6 +223,7 @@ def _adopt(context: Context, sparse_path: Path) -> None:
         new.mkdir()
         for folder in model_folders(sparse_path):
             copy_with_keypoints(folder, new / folder.name, workspace.database)
+        copy_thrown_away(sparse_path, new)
     workspace.record_mapping(context.current_model_inputs())
 
 
@@ -243,6 +246,7 @@ def keep_best(context: Context) -> None:
         new.mkdir()
         for folder in model_folders(workspace.sparse):
             shutil.copytree(folder, new / folder.name)
+        copy_thrown_away(workspace.sparse, new)
         shutil.copy(workspace.matches, new / workspace.matches.name)
         replace_text(new / SCORE, json.dumps([_set_of(context), present]))
 

@@ -121,7 +121,14 @@ class Trial:
 
     @property
     def is_better(self) -> bool:
-        """Whether it takes the place of what is there."""
+        """Whether it takes the place of what is there.
+
+        Inliers that a surely wrong model stood on count for nothing: others that
+        verify the pair are tried in their place, also where they are fewer.
+        """
+        num_inliers, _ = self.worth
+        if self.before.is_questioned:
+            return num_inliers > 0
         return self.worth > self.before.worth
 
 

@@ -41,6 +41,7 @@ class PairState:
         tried: a bit for each level that it was matched at.
         measured_worth: of the measured matches that learned ones took the place of.
         learned_level: of learned matches that are kept beside those in use; -1 if there are none.
+        is_questioned: whether a model stood on it that was surely wrong.
     """
 
     num_inliers: int
@@ -49,6 +50,7 @@ class PairState:
     tried: int = 1
     measured_worth: Worth = (0, 0)
     learned_level: int = -1
+    is_questioned: bool = False
 
     @property
     def worth(self) -> Worth:
@@ -254,13 +256,13 @@ class StepPlanner:
         A component apart from the largest one must be joined to others before all. Where n
         verified pairs with images of the model did not save an image, another does with
         1 / (n + 1), about. While there is no model, each pair of images to match again may begin
-        one.
+        one, and so may other matches of a pair that a wrong model stood on.
         """
         first = self._component_of[pair[0]]
         second = self._component_of[pair[1]]
         if first != second:
             return self._joined_component(max(first, second))  # the smaller one
-        if first and self.registered:
+        if first and self.registered and not self.states[pair].is_questioned:
             return []
         connections = list[Connection]()
         for name in pair:
@@ -277,7 +279,12 @@ class StepPlanner:
         return [Connection(number, weight)] if weight else []
 
     def _is_strong(self, pair: Pair) -> bool:
-        """Tell whether a pair needs nothing more; while there is no model, none is."""
+        """Tell whether a pair needs nothing more; while there is no model, none is.
+
+        Nor is one that only speaks for a model that was surely wrong.
+        """
+        if self.states[pair].is_questioned:
+            return False
         has_many = self.states[pair].num_inliers >= self.strong_num_inliers
         is_well_connected = self.weakly_connected.isdisjoint(pair)
         return has_many and bool(self.registered) and is_well_connected

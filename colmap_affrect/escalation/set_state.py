@@ -11,6 +11,7 @@ from colmap_affrect.escalation.expected_gain import PairState, insecure_images
 from colmap_affrect.escalation.policy import Situation
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import MIN_LARGE_SET
+from colmap_affrect.mappers.wrong_models import read_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
 from colmap_affrect.project.report import ModelSummary
@@ -138,6 +139,8 @@ class SetState:
         tried = matches.levels(num_inliers, "tried")
         measured = matches.measured_worths(num_inliers)
         learned = matches.learned_levels(num_inliers)
+        thrown_away = read_thrown_away(self.context.workspace.sparse)
+        stood_on = thrown_away.num_inliers()
         states = dict[Pair, PairState]()
         for pair, count in num_inliers.items():
             states[pair] = PairState(
@@ -147,6 +150,8 @@ class SetState:
                 tried=tried[pair],
                 measured_worth=measured[pair],
                 learned_level=learned[pair],
+                # Until it has other matches, with another number of inliers
+                is_questioned=stood_on.get(pair) == count,
             )
         return states
 

@@ -46,6 +46,8 @@ class MapperOptions(PartOptions, PresetOptions):
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
     can_extend: ClassVar[bool] = True  # register images into a finished model
+    max_images_of_some_pairs: ClassVar[int] = 0
+    """Fewer images than these a mapper can map by some of their pairs."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ class MappingTask:
     may_share: bool = False
     # keypoints of the tie points, by point and image name
     tie_points: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    # pairs of image ids that are not used, by mappers that can leave out pairs
+    without_pairs: frozenset[tuple[int, int]] = frozenset()
     # graphs that pair_graph.graph_of has read, by database and fewest inliers of a pair;
     # tasks that ``replace`` makes of this one share them
     graphs: dict[tuple[Path, int], PairGraph] = field(default_factory=dict, repr=False)

@@ -3,12 +3,10 @@
 A summary of each finished model is kept beside it: COLMAP's files cannot hold it all.
 """
 
-import math
 import threading
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,28 +22,27 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.focal_observability import focal_growths
-from colmap_affrect.mappers.given_principal_points import contradicted_principal_points
-from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
-    MIN_SHARE,
+    Ids,
     PairGraph,
     cameras_of,
     graph_of,
     poses_of,
 )
-from colmap_affrect.mappers.reliability import (
-    NUM_REASONS,
-    Confidence,
-    score_images,
-    share_within_limit,
-)
 from colmap_affrect.mappers.same_viewpoint import same_viewpoint_pairs
+from colmap_affrect.mappers.scored_models import ScoredModel, scored_places
 from colmap_affrect.mappers.snapshots import with_snapshots
-from colmap_affrect.mappers.surer_apart import surer_apart
-from colmap_affrect.mappers.surroundings import apart, known_places
 from colmap_affrect.mappers.tie_points import tie_points_of
+from colmap_affrect.mappers.wrong_models import (
+    NUM_OTHER_HYPOTHESES,
+    WITHOUT_FALSE_PAIRS,
+    ThrownAway,
+    pairs_stood_on,
+    pairs_to_leave_out,
+    thrown_away_of,
+    write_thrown_away,
+)
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.reasons import Doubt
@@ -54,13 +51,9 @@ from colmap_affrect.project.report import (
     DOUBTFUL,
     SURE,
     ModelSummary,
-    PrincipalPointContradiction,
     kept_probability,
 )
 
-MIN_PROBABILITY = 0.05
-"""Images leave their model below this probability: nineteen of twenty such poses are wrong
-(theory)."""
 ENOUGH_OF_SMALL_SET = 0.8  # of all images: such a model is never too small (COLMAP)
 # What was begun is removed while a call of COLMAP may still write there.
 NUM_REMOVALS = 5  # times that this is tried; resource
@@ -125,24 +118,6 @@ def model_folders(sparse_path: Path) -> list[Path]:
     return sorted((p for p in folders if p.name.isdecimal()), key=lambda p: int(p.name))
 
 
-@dataclass
-class _ScoredModel:
-    """A model and the confidence in its images."""
-
-    mapped: MappedModel
-    # Of its images, by name
-    confidences: dict[str, Confidence] = field(default_factory=dict)
-    # Of images that it has lost
-    taken_out: dict[str, Confidence] = field(default_factory=dict)
-    contradictions: Sequence[PrincipalPointContradiction] = ()
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Numbers of images and points."""
-        model = self.mapped.reconstruction
-        return model.num_reg_images(), model.num_points3D()
-
-
 class _Progress:
     """Passes on by how many images the largest model has grown."""
 
@@ -191,22 +166,24 @@ def map_database(
     snapshots = sparse_path.with_name(sparse_path.name + ".snapshots")
     keeps_models = task.extend or task.previous_models
     remove_own([partial] if keeps_models else [partial, sparse_path])
-    num_images = len(graph_of(task, MIN_NUM_MATCHES).names)
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    num_images = len(graph.names)
+    least = 1 if task.extend else mapper.options.min_model_size
+    least = max(1, min(least, int(ENOUGH_OF_SMALL_SET * num_images)))
     progress = _Progress(next_image, num_images)
+    judged = _Judged(task, least)
     try:
         with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
             raw = partial / "raw"
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
+            judged.add(found)
+            _map_without_false_pairs(mapper, judged, raw, progress)
             remove_own([raw])
-        scored = list[_ScoredModel]()
-        for model in found:
-            scored += _scored_places(model, task)
-        min_model_size = 1 if task.extend else mapper.options.min_model_size
-        kept = _large_enough(scored, min_model_size, num_images)
-        kept.sort(key=lambda model: model.size, reverse=True)
-        _pass_on_reasons(scored, kept)
-        summaries = _write_models(kept, task, partial)
+        judged.kept.sort(key=lambda model: model.size, reverse=True)
+        _pass_on_reasons(judged.scored, judged.kept)
+        summaries = _write_models(judged.kept, task, partial)
+        write_thrown_away(judged.thrown_away(), partial)
         remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
@@ -214,15 +191,75 @@ def map_database(
     return summaries
 
 
-def _large_enough(
-    models: Sequence[_ScoredModel], min_model_size: int, num_images: int
-) -> list[_ScoredModel]:
-    """Return the models that are large enough, for the number of all images."""
-    least = max(1, min(min_model_size, int(ENOUGH_OF_SMALL_SET * num_images)))
-    return [model for model in models if len(model.confidences) >= least]
+class _Judged:
+    """Models that were made, with their images scored, and what is left of them."""
+
+    def __init__(self, task: MappingTask, least: int) -> None:
+        """Begin without models.
+
+        Args:
+            task: What is mapped.
+            least: Images of a model that is kept.
+        """
+        self.task = task
+        self.graph = graph_of(task, MIN_NUM_MATCHES)
+        self.least = least
+        self.kept = list[ScoredModel]()
+        self.stood_on = set[Ids]()
+        """Pairs that models stood on of which nothing is left."""
+        self._of_wrong_models = set[int]()  # images of these models
+        self.scored = list[ScoredModel]()
+
+    def add(self, found: Sequence[MappedModel]) -> None:
+        """Score models, and keep what is large enough of them."""
+        for mapped in found:
+            poses = poses_of(mapped.reconstruction)  # before images leave it
+            cameras = cameras_of(mapped.reconstruction)
+            scored = scored_places(mapped, self.task)
+            self.scored += scored
+            self.kept += [one for one in scored if len(one.confidences) >= self.least]
+            if not any(one.confidences for one in scored):
+                self.stood_on |= pairs_stood_on(self.graph, poses, cameras)
+                self._of_wrong_models.update(poses)
+
+    def image_ids_left(self) -> set[int]:
+        """Return the images that no model has, where one was thrown away; else none.
+
+        Also those that were in none: pairs may tie them to images of the wrong one.
+        """
+        if not self._of_wrong_models:
+            return set()
+        left = set(self.graph.keypoints)
+        for model in self.kept:
+            left.difference_update(model.mapped.reconstruction.reg_image_ids())
+        return left
+
+    def _doubts_of_missing(self) -> dict[str, tuple[Doubt, ...]]:
+        """Return why images that no model has were taken out of theirs, by name."""
+        inside = set[str]()
+        for model in self.kept:
+            inside |= model.confidences.keys()
+        found = dict[str, tuple[Doubt, ...]]()
+        for model in self.scored:
+            for name, one in model.taken_out.items():
+                if name not in inside:
+                    found.setdefault(name, one.reasons)
+        return found
+
+    def thrown_away(self) -> ThrownAway:
+        """Return what is known of images of models of which nothing is left."""
+        left = self.image_ids_left() & self._of_wrong_models
+        doubts = self._doubts_of_missing()
+        of_them = dict[str, tuple[Doubt, ...]]()
+        for name in sorted(self.graph.names[image_id] for image_id in left):
+            if name in doubts:
+                of_them[name] = doubts[name]
+        return thrown_away_of(self.graph, of_them, self.stood_on)
 
 
-def _pass_on_reasons(models: Sequence[_ScoredModel], kept: list[_ScoredModel]) -> None:
+def _pass_on_reasons(
+    models: Sequence[ScoredModel], kept: Sequence[ScoredModel]
+) -> None:
     """Let the first model that is kept say of images of dropped ones why they were taken out."""
     inside = set[str]()
     for model in kept:
@@ -231,6 +268,34 @@ def _pass_on_reasons(models: Sequence[_ScoredModel], kept: list[_ScoredModel]) -
         for name, one in model.taken_out.items():
             if kept and name not in inside:
                 kept[0].taken_out[name] = one
+
+
+def _map_without_false_pairs(
+    mapper: Mapper, judged: _Judged, folder: Path, progress: _Progress
+) -> None:
+    """Map photographs of wrong models once more, without the pairs that these stood on.
+
+    Args:
+        mapper: Makes the models.
+        judged: Gets the models.
+        folder: Of what mappers write.
+        progress: Is told of images.
+    """
+    for number in range(NUM_OTHER_HYPOTHESES):
+        image_ids = judged.image_ids_left()
+        if not 0 < len(image_ids) < mapper.options.max_images_of_some_pairs:
+            return
+        left_out = pairs_to_leave_out(judged.graph, image_ids, judged.stood_on)
+        if not left_out:
+            return
+        other = replace(judged.task, previous_models=(), without_pairs=left_out)
+        output_path = folder / f"other-{number}"
+        output_path.mkdir()
+        seed = mapper.options.random_seed
+        found = mapper.map(other, output_path, seed, progress.show)
+        if not found:
+            return
+        judged.add([mapped.also_by(WITHOUT_FALSE_PAIRS) for mapped in found])
 
 
 def _remove_unfinished(partial: Path) -> None:
@@ -247,7 +312,7 @@ def _remove_unfinished(partial: Path) -> None:
 
 
 def _write_models(
-    models: Sequence[_ScoredModel], task: MappingTask, folder: Path
+    models: Sequence[ScoredModel], task: MappingTask, folder: Path
 ) -> list[ModelSummary]:
     """Write models, with their last points, and their summaries.
 
@@ -268,211 +333,7 @@ def _write_models(
     return summaries
 
 
-def _scored_places(mapped: MappedModel, task: MappingTask) -> list[_ScoredModel]:
-    """Return a model for each place that a model holds, the largest first, with all scored.
-
-    A model that is extended stays whole, what a person has tied by hand, and rigs.
-    """
-    graph = graph_of(task, MIN_NUM_MATCHES)
-    if task.extend or task.tie_points or graph.has_rigs:
-        whole = _without_wrong_images(mapped, task)
-        _doubt_motion(whole, task)
-        return [whole]
-    places = known_places(mapped, graph)
-    places = surer_apart(mapped, places, lambda one: _probabilities(one, task))
-    largest, *others = apart(mapped, places)
-    scored = _without_wrong_images(largest, task)
-    for name, doubt in mapped.apart.items():
-        scored.taken_out[name] = Confidence(0.0, (doubt,))
-    found = [scored]
-    for other in others:
-        names = [graph.names[i] for i in sorted(other.reconstruction.reg_image_ids())]
-        for name in names:
-            scored.taken_out[name] = Confidence(0.0, (Doubt(places.why),))
-        if len(names) > 1:
-            found.append(_without_wrong_images(other, task))
-    for model in found:
-        _doubt_motion(model, task)
-        for image_id in places.collages:
-            _doubt(model, graph.names[image_id], 0.5, Doubt("two_places"))
-        for image_id, share in places.unclear.items():
-            _doubt(model, graph.names[image_id], share, Doubt("other_surroundings"))
-    return found
-
-
-def _probabilities(mapped: MappedModel, task: MappingTask) -> dict[int, float]:
-    """Return the probability of each image that stays in a model, which is changed."""
-    confidences = _without_wrong_images(mapped, task).confidences
-    found = dict[int, float]()
-    for name, one in confidences.items():
-        image_id = mapped.reconstruction.find_image_with_name(name).image_id
-        found[image_id] = one.probability
-    return found
-
-
-def _doubt_motion(model: _ScoredModel, task: MappingTask) -> None:
-    """Doubt a model where something moves in another way: that may be the scene as well."""
-    graph = graph_of(task, MIN_NUM_MATCHES)
-    found = share_of_motion(model.mapped.reconstruction, graph)
-    share = min(found, model.mapped.motion_share)
-    if share < 1.0:
-        doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})
-        for name in list(model.confidences):
-            _doubt(model, name, share, doubt)
-
-
-def _doubt_given_principal_points(scored: _ScoredModel, task: MappingTask) -> None:
-    """Doubt rotations that hang on given principal points which the points contradict."""
-    model = scored.mapped.reconstruction
-    scored.contradictions = contradicted_principal_points(model, task)
-    for one in scored.contradictions:
-        for name, turn_deg in one.turns_deg.items():
-            values = {
-                "given_x_px": one.given_px[0],
-                "given_y_px": one.given_px[1],
-                "fitting_x_px": one.fitting_px[0],
-                "fitting_y_px": one.fitting_px[1],
-                "turn_deg": turn_deg,
-            }
-            doubt = Doubt("principal_point_contradicted", {**values})
-            _doubt(scored, name, share_within_limit(turn_deg), doubt)
-
-
-def _doubt(model: _ScoredModel, name: str, share: float, doubt: Doubt) -> None:
-    """Multiply the probability of an image, if it is there.
-
-    Args:
-        model: Is changed.
-        name: Of the image.
-        share: Factor of the probability.
-        doubt: The reason.
-    """
-    known = model.confidences.get(name)
-    if known:
-        others = known.reasons if known.probability < SURE else ()  # of sure ones: none
-        reasons = (doubt, *others)[:NUM_REASONS]
-        model.confidences[name] = replace(
-            known, probability=share * known.probability, reasons=reasons
-        )
-
-
-def _without_wrong_images(mapped: MappedModel, task: MappingTask) -> _ScoredModel:
-    """Take out the images that are surely wrong, the worst one first, and score all.
-
-    The reconstruction itself is changed; nothing is left of it with fewer than two images. Of a rig
-    all images leave that were taken at once. Those of a model that is extended stay.
-    """
-    model = mapped.reconstruction
-    scored = _ScoredModel(mapped)
-    growths = focal_growths(model, task)
-    is_stale = False  # growths are of a model with a few images more
-    while model.num_reg_images() > 1:
-        confidences = _best_of_frames(model, score_images(mapped, task, growths))
-        worst = min(confidences, key=lambda name: confidences[name].of_evidence)
-        is_wrong = confidences[worst].of_evidence < MIN_PROBABILITY and not task.extend
-        if is_wrong:
-            for name in _deregister(model, worst):
-                scored.taken_out[name] = confidences[worst]
-            is_stale = True
-        elif is_stale:
-            growths = focal_growths(model, task)
-            is_stale = False
-        else:
-            scored.confidences = _no_surer_than_ties(confidences, mapped, task)
-            _doubt_given_principal_points(scored, task)
-            return scored
-    return scored
-
-
-def _no_surer_than_ties(
-    confidences: Mapping[str, Confidence], mapped: MappedModel, task: MappingTask
-) -> dict[str, Confidence]:
-    """Return confidences of which those of bridged images are at most what they hang on.
-
-    A bridged image hangs on the surest image that an agreeing pair ties it to; where that is a
-    bridged one, on what that hangs on, too. So what counts is the way to an image that was not
-    bridged whose least sure image is surest. Images that no such way leads to stay as they are.
-
-    Args:
-        confidences: By image name.
-        mapped: The model.
-        task: What it was made from.
-    """
-    if not mapped.bridges:
-        return dict(confidences)
-    partners = _agreeing_partners(mapped, task)
-    left = sorted(mapped.bridges.keys() & confidences.keys())
-    found = {name: one for name, one in confidences.items() if name not in left}
-    while left:
-        best: tuple[float, str, str] | None = None
-        for name in left:
-            for other in sorted(partners[name] & found.keys()):
-                probability = found[other].probability
-                if best is None or probability > best[0]:
-                    best = probability, name, other
-        if best is None:
-            break
-        _, name, other = best
-        found[name] = _no_surer_than(confidences[name], other, found[other])
-        left.remove(name)
-    return {name: found.get(name, one) for name, one in confidences.items()}
-
-
-def _no_surer_than(one: Confidence, other_name: str, other: Confidence) -> Confidence:
-    """Return the confidence in an image that hangs on another one, whose name the reason says."""
-    if other.probability >= one.probability:
-        return one
-    percent = math.floor(100.0 * other.probability)
-    doubt = Doubt("hangs_on", {"other": other_name, "percent": percent})
-    reasons = (doubt, *one.reasons)[:NUM_REASONS]
-    return replace(one, probability=other.probability, reasons=reasons)
-
-
-def _agreeing_partners(
-    mapped: MappedModel, task: MappingTask
-) -> defaultdict[str, set[str]]:
-    """Return the images that pairs which agree with a model tie each of its images to, by name."""
-    graph = graph_of(task, MIN_NUM_MATCHES)
-    poses = poses_of(mapped.reconstruction)
-    cameras = cameras_of(mapped.reconstruction)
-    partners = defaultdict[str, set[str]](set)
-    for pair in graph.pairs_inside(poses):
-        if graph.agreement(pair, poses, cameras) >= MIN_SHARE:
-            first, second = (graph.names[image_id] for image_id in pair.ids)
-            partners[first].add(second)
-            partners[second].add(first)
-    return partners
-
-
-def _deregister(model: pycolmap.Reconstruction, name: str) -> list[str]:
-    """Deregister an image with all that a rig took with it; return their names."""
-    frame_id = model.find_image_with_name(name).frame_id
-    names = list[str]()
-    for image in model.images.values():
-        if image.frame_id == frame_id and image.has_pose:
-            names.append(image.name)
-    model.deregister_frame(frame_id)
-    return names
-
-
-def _best_of_frames(
-    model: pycolmap.Reconstruction, confidences: Mapping[str, Confidence]
-) -> dict[str, Confidence]:
-    """Return for each image the confidence in the surest one that a rig took with it.
-
-    A rig is rigid: where the pose of one of its images is right, that of the others is, which may
-    see next to nothing.
-    """
-    frames = {name: model.find_image_with_name(name).frame_id for name in confidences}
-    best = dict[int, Confidence]()
-    for name, confidence in confidences.items():
-        known = best.get(frames[name])
-        if not known or confidence.probability > known.probability:
-            best[frames[name]] = confidence
-    return {name: best[frame_id] for name, frame_id in frames.items()}
-
-
-def _summary(scored: _ScoredModel, task: MappingTask) -> ModelSummary:
+def _summary(scored: ScoredModel, task: MappingTask) -> ModelSummary:
     """Count what a model holds, and say how sure it is of each photograph."""
     model = scored.mapped.reconstruction
     graph = graph_of(task, MIN_NUM_MATCHES)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
@@ -20,6 +20,7 @@ from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOption
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
+from colmap_affrect.mappers.point_joining import joined_by_points
 from colmap_affrect.mappers.principal_points import (
     axis_turns_deg,
     freed_principal_point_cost,
@@ -56,6 +57,7 @@ class SparseOptions(PipelineOptions):
     """Incremental mapping with priors of the cameras, and bridges by single pairs."""
 
     name: Literal["sparse"] = "sparse"
+    max_images_of_some_pairs: ClassVar[int] = MIN_LARGE_SET
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40  # judged
     # COLMAP's 16, halved twice, as its pipeline does where no first pair is found
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0
@@ -96,7 +98,7 @@ class SparseMapper(IncrementalMapper):
             KeyboardInterrupt: After mapping has been stopped.
         """
         native = self.native(task, random_seed)
-        graph = graph_of(task, native.min_num_matches)
+        graph = graph_of(task, native.min_num_matches).without(task.without_pairs)
 
         def show_or_stop(count: int) -> None:
             if task.cancellation and task.cancellation.is_cancelled:
@@ -144,15 +146,17 @@ class SparseMapper(IncrementalMapper):
         hypothesis, which scores higher where they differ, or some images are parts of others.
         """
         bare = replace(task, image_path=None, snapshot_path=None)
-        by_colmap = partial(super().map, bare, output_path, native.random_seed, show)
-        best = self._tested(task, graph, native, show, by_colmap)
+        seed = native.random_seed
+        whole_by_colmap = partial(super().map, bare, output_path, seed, show)
 
-        def map_again(some: PairGraph) -> list[MappedModel]:
+        def map_some(some: PairGraph) -> list[MappedModel]:
             # COLMAP's own mapper, which would take all pairs, makes none.
             return self._tested(task, some, native, show, by_colmap=list)
 
+        by_colmap = list if task.without_pairs else whole_by_colmap
+        best = self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
-            best = with_places_mapped_again(best, graph, map_again)
+            best = with_places_mapped_again(best, graph, map_some)
         for mapped in best:
             if not has_rigs(mapped.reconstruction):  # which tell the scale
                 mapped.reconstruction.normalize()  # as COLMAP does
@@ -325,6 +329,7 @@ class _HypothesisTest:
         self._try_straight_lens()
         self._try_shifted_axes()
         self.best = with_other_groups(self.search, self.best)
+        self.best = joined_by_points(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
 
     def _hypotheses(self) -> list[_Hypothesis]:

@@ -1,5 +1,6 @@
 """Why photographs are missing or doubted: codes with values, and the one place that says them."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -123,6 +124,7 @@ MissingCode = Literal[
     "no_verified_pair",
     "not_registered",
     "taken_out",
+    "wrong_model",
 ]
 
 FATES: dict[MissingCode, str] = {
@@ -135,6 +137,7 @@ FATES: dict[MissingCode, str] = {
     "no_verified_pair": "no verified pair",
     "not_registered": "not registered",
     "taken_out": "taken out, {doubts}",
+    "wrong_model": "its model was surely wrong: {doubts}",
 }
 """What to say of an image that is not in the largest model."""
 
@@ -174,3 +177,22 @@ class Missing:
         if self.doubts:
             found["doubts"] = [doubt.to_mapping() for doubt in self.doubts]
         return found
+
+
+def why_model_was_wrong(missing: Iterable[Missing]) -> str:
+    """Return how many images a wrong model had, and the main reason of most of them.
+
+    Args:
+        missing: Why images are in no model.
+
+    Returns:
+        A few words; none where no model was wrong.
+    """
+    reasons = Counter[str]()
+    for one in missing:
+        if one.code == "wrong_model":
+            reasons[text_of(one.doubts[:1])] += 1
+    if not reasons:
+        return ""
+    why, _ = reasons.most_common(1)[0]
+    return f"that of {reasons.total()} photographs was surely wrong: {why}"

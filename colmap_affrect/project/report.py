@@ -14,7 +14,13 @@ from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.line_report import LineReport
-from colmap_affrect.project.reasons import Doubt, Missing, mappings_of, texts_of
+from colmap_affrect.project.reasons import (
+    Doubt,
+    Missing,
+    mappings_of,
+    texts_of,
+    why_model_was_wrong,
+)
 from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
 
 NUM_WORST = 3  # tie points that a summary names; display
@@ -401,6 +407,9 @@ class ReconstructionReport(Summarized):
             return f"one image cannot make a model{unreadable}"
         if not self.num_verified_pairs:
             return "no model was found: no pair of images is verified"
+        wrong = why_model_was_wrong(self.unregistered.values())
+        if wrong:
+            return f"no model is kept: {wrong}"
         return f"no model was found: {self.num_verified_pairs} verified pairs do not make one"
 
     @property
@@ -464,9 +473,8 @@ class ReconstructionReport(Summarized):
 
     def summary(self, *, with_warnings: bool = True) -> str:
         """Return one screen of text."""
-        num_registered = len(self.registered_names)
         lines = [
-            f"registered  {num_registered} of {self.images_total} images",
+            f"registered  {len(self.registered_names)} of {self.images_total} images",
             *self._extension_lines(),
             *self._missing_lines(),
             f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified",

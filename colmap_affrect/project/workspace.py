@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
+FILES_BESIDE_MODELS = {"thrown_away.json"}
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends; resource
 OWN_STEMS = {  # how names of files and folders begin that are written here
     "cameras", "config", "database", "features", "guided", "matches", "methods", "pairs",
@@ -425,7 +426,8 @@ class Workspace:
         for path in self.sparse.glob("*"):
             is_model = path.is_dir() and path.name.isdecimal()
             for file in path.iterdir() if is_model else [path]:
-                is_own = is_model and file.name in FILES_OF_MODEL
+                own_names = FILES_OF_MODEL if is_model else FILES_BESIDE_MODELS
+                is_own = file.name in own_names
                 if not is_own and not file.name.startswith("."):
                     foreign.append(file)
         if foreign:

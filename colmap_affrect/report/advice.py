@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 
 from colmap_affrect.errors import such_as
-from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.pair_graph import MAX_ERROR, MIN_NUM_MATCHES
+from colmap_affrect.mappers.wrong_models import read_thrown_away
 from colmap_affrect.options import EFFORT_NAMES, EffortName
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.reasons import Doubt, DoubtCode
 from colmap_affrect.project.report import Advice, MatchedAgain, ModelSummary
@@ -26,6 +28,7 @@ ENOUGH = 100  # inliers of a pair that make a model wherever it shows depth
 MAX_BY_CHANCE = 0.03
 """Share of the inliers of a pair that chance alone may put on epipolar lines and off a homography
 (theory: the width of their band by that of a photograph)."""
+NUM_STRONGEST = 10  # pairs that are looked at for depth; resource
 MIN_GAIN = 0.05  # of a probability, by more matches
 CONTRADICTED: Collection[DoubtCode] = ("matches_disagree", "little_agreement")
 """Doubts of photographs whose matches are rather wrong than few."""
@@ -114,10 +117,7 @@ def advice(
         )
     found = _of_effort(case)
     if not models and strongest >= ENOUGH:
-        why = "more photographs, from other places: the matches of these show no depth"
-        if _strongest_shows_depth(context):
-            why = "more photographs between these: matches show depth, but contradict each other"
-        return (*found, Advice(why))
+        return (*found, Advice(_why_no_model(context)))
     if lost or case.doubts or case.moves:
         for rule in RULES:
             found += rule(case)
@@ -134,16 +134,43 @@ def command_with_masks(context: Context) -> str:
     return _anew(context, "--mask-path", "masks")
 
 
-def _strongest_shows_depth(context: Context) -> bool:
-    """Tell whether the inliers of the strongest pair show depth."""
-    inliers = context.graph.inliers(1)
-    names = max(inliers, key=lambda pair: len(inliers[pair]))
+def _why_no_model(context: Context) -> str:
+    """Return what photographs lack whose pairs make no model, though one has enough inliers."""
+    if not _any_shows_depth(context):
+        return "more photographs, from other places: the matches of these show no depth"
+    thrown_away = read_thrown_away(context.workspace.sparse)
+    doubts = itertools.chain.from_iterable(thrown_away.doubts.values())
+    codes = {doubt.code for doubt in doubts}
+    why = "contradict each other"
+    if codes and codes.isdisjoint(CONTRADICTED):
+        why = "too few agree on one model"
+    return f"more photographs between these: matches show depth, but {why}"
+
+
+def _any_shows_depth(context: Context) -> bool:
+    """Tell whether the inliers of one of the strongest pairs show depth."""
+    inliers = context.graph.inliers(ENOUGH)
+    strongest = sorted(inliers, key=lambda pair: -len(inliers[pair]))
+    for names in strongest[:NUM_STRONGEST]:
+        if _pair_shows_depth(context, names, inliers[names]):
+            return True
+    return False
+
+
+def _pair_shows_depth(context: Context, names: Pair, inliers: Indices) -> bool:
+    """Tell whether the inliers of a pair show depth.
+
+    Args:
+        context: Of the workspace.
+        names: Of both photographs.
+        inliers: (M, 2) keypoints.
+    """
     points = []
     sides = []
     with context.graph.open_to_read() as database:
         for side, name in enumerate(names):
             keypoints = database.read_keypoints(context.graph.ids[name])
-            rows = inliers[names][:, side]
+            rows = inliers[:, side]
             points.append(np.asarray(keypoints, np.float64)[rows, :2])
             camera = context.graph.cameras[name]
             sides += [camera.width, camera.height]

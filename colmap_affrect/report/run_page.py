@@ -20,7 +20,6 @@ from colmap_affrect.project.reasons import FATES, Doubt, text_of
 from colmap_affrect.project.report import (
     MAX_LINES,
     SOURCES,
-    ModelSummary,
     by_story,
     largest_of,
     probability_text,

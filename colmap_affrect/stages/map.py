@@ -16,11 +16,12 @@ from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.wrong_models import ThrownAway, read_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.record import OWN, ModelInputs
-from colmap_affrect.project.report import ModelSummary, StageReport
+from colmap_affrect.project.report import NO_MODEL, ModelSummary, StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.verify import extracted_px
@@ -227,14 +228,15 @@ def unregistered(
     for (first, second), count in pair_inliers.items():
         partners[first][second] = count
         partners[second][first] = count
-    largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
+    largest = models[0] if models else NO_MODEL
     registered = set(largest.registered_names)
+    thrown_away = read_thrown_away(context.workspace.sparse)
     reasons = dict[str, Missing]()
     for name in names:
         if name in registered:
             continue
         why = _why_not_mapped(context, name, models, partners)
-        reasons[name] = why or _why_lost(name, partners[name], largest)
+        reasons[name] = why or _why_lost(name, partners[name], largest, thrown_away)
     return reasons
 
 
@@ -271,11 +273,26 @@ def _why_not_mapped(
     return None if num_keypoints[name] else Missing("no_features")
 
 
-def _why_lost(name: str, partners: Mapping[str, int], largest: ModelSummary) -> Missing:
-    """Return why an image with features is not in the largest model, by its verified pairs."""
+def _why_lost(
+    name: str,
+    partners: Mapping[str, int],
+    largest: ModelSummary,
+    thrown_away: ThrownAway,
+) -> Missing:
+    """Return why an image with features is not in the largest model, by its verified pairs.
+
+    Args:
+        name: of the image.
+        partners: inliers of its verified pairs, by the other image.
+        largest: the largest model.
+        thrown_away: what is known of models that were not kept.
+    """
     if not partners:
         return Missing("no_verified_pair")
     best = dict(sorted(partners.items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS])
+    if name in thrown_away.doubts:
+        doubts = thrown_away.doubts[name]
+        return Missing("wrong_model", partners=best, doubts=doubts)
     if name in largest.taken_out:
         return Missing("taken_out", partners=best, doubts=largest.taken_out[name])
     return Missing("not_registered", partners=best)

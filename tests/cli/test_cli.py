@@ -14,7 +14,7 @@ from small_scene import write_photographs
 
 from colmap_affrect.cli import main
 from colmap_affrect.colmap.model_files import model_poses
-from colmap_affrect.mappers import mapping
+from colmap_affrect.mappers import scored_models
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.project.reasons import Doubt
@@ -280,7 +280,7 @@ def test_model_that_nobody_can_trust_ends_with_3(
             model_poses(mapped.reconstruction), Confidence(0.3, (Doubt("few_matches"),))
         )
 
-    monkeypatch.setattr(mapping, "score_images", score)
+    monkeypatch.setattr(scored_models, "score_images", score)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "results " in printed.out

@@ -73,7 +73,7 @@ def moved(
         blob = np.zeros((15, 2), "<u4").tobytes()
         rows.append((first * MAX_NUM_IMAGES + second, 15, 2, blob, b"", b"", b""))
 
-    def share(_: object, ids: tuple[int, int], *__: object) -> float:
+    def share(ids: tuple[int, int], **_: object) -> float:
         return 0.0 if wrong in ids else 1.0
 
     monkeypatch.setattr(moved_keypoints, "rows_of", lambda *_: rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.escalation import set_state
+from colmap_affrect.escalation.escalate import Trial
 from colmap_affrect.escalation.expected_gain import (
     Candidate,
     LevelStatistics,
@@ -18,9 +20,15 @@ from colmap_affrect.escalation.expected_gain import (
     _Selection,
 )
 from colmap_affrect.escalation.set_state import SetState, _megapixels
+from colmap_affrect.mappers.wrong_models import (
+    StoodOn,
+    ThrownAway,
+    write_thrown_away,
+)
+from colmap_affrect.project.match_store import PairMatches
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, ModelSummary
-from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.recipes import EscalateOptions, load_recipe
 
 NAMES = ["doubtful.jpg", "likely.jpg", "missing.jpg", "out.jpg", "sure.jpg"]
 
@@ -155,6 +163,68 @@ def test_inliers_of_a_pair_are_found_whichever_image_is_the_first() -> None:
     context.num_verified_inliers = lambda: {("a", "b"): 20, ("c", "a"): 30}
     context.usable = lambda _: listed
     assert state.num_inliers() == {("a", "b"): 20, ("a", "c"): 30, ("b", "c"): 0}
+
+
+def test_a_pair_is_questioned_while_it_has_the_inliers_that_a_wrong_model_stood_on(
+    tmp_path: Path,
+) -> None:
+    state = state_of(NAMES, ())
+    pairs = [("a", "b"), ("b", "c")]
+    counts = {("b", "a"): 400, ("b", "c"): 90}
+    context: Any = state.context
+    context.workspace.sparse = tmp_path
+    context.num_verified_inliers = lambda: counts
+    context.usable = lambda _: pairs
+    context.matches = SimpleNamespace(
+        levels=lambda pairs, _="level": dict.fromkeys(pairs, 0),
+        measured_worths=lambda pairs: dict.fromkeys(pairs, (0, 0)),
+        learned_levels=lambda pairs: dict.fromkeys(pairs, -1),
+    )
+    stood_on = (StoodOn("b", "a", 400), StoodOn("b", "c", 120))
+    known = ThrownAway({"a": (Doubt("little_agreement", {"percent": 9}),)}, stood_on)
+    write_thrown_away(known, tmp_path)
+    questioned = {pair: one.is_questioned for pair, one in state.states().items()}
+    assert questioned == {("a", "b"): True, ("b", "c"): False}
+    counts["b", "a"] = 60  # of other matches
+    assert not state.states()["a", "b"].is_questioned
+
+
+@pytest.mark.parametrize(
+    ("is_questioned", "worth", "is_better"),
+    [(True, (20, 0), True), (True, (0, 50), False), (False, (20, 0), False)],
+)
+def test_other_matches_take_the_place_of_those_that_a_wrong_model_stood_on(
+    worth: tuple[int, int], *, is_questioned: bool, is_better: bool
+) -> None:
+    before = PairState(num_inliers=400, is_questioned=is_questioned)
+    found = PairMatches(
+        ("a", "b"), np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 9
+    )
+    assert Trial(found, worth, before).is_better == is_better
+
+
+@pytest.mark.parametrize(("is_questioned", "num"), [(True, 1), (False, 0)])
+def test_a_strong_pair_is_matched_again_where_a_wrong_model_stood_on_it(
+    num: int, *, is_questioned: bool
+) -> None:
+    """Its photographs are apart from the model that is kept, and have many inliers."""
+    states = {
+        ("a", "b"): PairState(num_inliers=500),
+        ("b", "c"): PairState(num_inliers=500),
+        ("d", "e"): PairState(num_inliers=400, is_questioned=is_questioned),
+    }
+    planner = StepPlanner(
+        states=states,
+        weakly_connected=set(),
+        weights={"d": 1.0, "e": 1.0},
+        megapixels=dict.fromkeys("abcde", 1.0),
+        unmeasured=(),
+        lacking=(),
+        registered=("a", "b", "c"),
+        strong_num_inliers=100,
+    )
+    level = load_recipe("default").levels[1]
+    assert len(planner.candidates(1, level, others=0b10)) == num
 
 
 def test_images_that_measured_frames_connect_to_likely_ones_are_anchored() -> None:

@@ -20,7 +20,7 @@ from mapping_tasks import (
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.mappers import incremental, mapping, snapshots
+from colmap_affrect.mappers import incremental, scored_models, snapshots
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
@@ -144,7 +144,9 @@ def test_the_model_that_is_extended_stays_until_all_images_are_scored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "sparse").mkdir()
-    monkeypatch.setattr(mapping, "score_images", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(
+        scored_models, "score_images", Mock(side_effect=KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         extended(database, old, tmp_path, "sparse/0")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]

@@ -30,18 +30,18 @@ from colmap_affrect.colmap.model_files import (
     relative_pose,
 )
 from colmap_affrect.errors import AffrectError, OptionError
-from colmap_affrect.mappers import mapping, snapshots
+from colmap_affrect.mappers import scored_models, snapshots
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.mappers.mapping import (
     _pass_on_reasons,
-    _ScoredModel,
     map_database,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
+from colmap_affrect.mappers.scored_models import ScoredModel
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
@@ -207,7 +207,7 @@ def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
 def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = [0.49996, 0.89996, 0.99996]
+    given = [0.49996, 0.89996, 0.99996, 0.99996]
 
     def scored(mapped: MappedModel, *_: object) -> dict[str, Confidence]:
         names = sorted(image.name for image in mapped.reconstruction.images.values())
@@ -217,14 +217,14 @@ def test_kept_probabilities_are_on_the_side_of_their_class_and_none_is_certain(
         }
 
     path = tmp_path / "database.db"
-    synthesize(path, num_rigs=3, num_points3D=150)
-    monkeypatch.setattr(mapping, "score_images", scored)
+    synthesize(path, num_rigs=4, num_points3D=150)
+    monkeypatch.setattr(scored_models, "score_images", scored)
     (model,), _ = reconstruct(path, mapper_of("incremental"))
-    first, second, third = model.registered_names
-    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999]
+    first, second, *others = model.registered_names
+    assert list(model.probabilities.values()) == [0.499, 0.899, 0.999, 0.999]
     doubts = (Doubt("few_matches"),)
     assert (model.doubtful, model.unsure) == ({first: doubts}, {second: doubts})
-    assert model.sure == (third,)
+    assert model.sure == tuple(others)
 
 
 def test_mapping_that_is_stopped_while_a_call_still_writes_is_interrupted_and_leaves_nothing(
@@ -335,7 +335,7 @@ def test_an_image_leaves_its_model_when_nineteen_of_twenty_such_poses_are_wrong(
             found[names[-1]] = Confidence(probability, doubts, 0.0, precision_factor)
         return found
 
-    monkeypatch.setattr(mapping, "score_images", score)
+    monkeypatch.setattr(scored_models, "score_images", score)
     ((model,), _) = reconstruct(tmp_path / "database.db", mapper_of("incremental"))
     assert len(model.registered_names) == num_images
     assert len(model.doubtful) == (num_images == 3)
@@ -347,8 +347,8 @@ def test_why_a_dropped_model_was_wrong_is_said_by_the_one_that_is_kept() -> None
     empty = MappedModel(pycolmap.Reconstruction())
     wrong = Confidence(0.01, (Doubt("matches_disagree"),))
     other = Confidence(0.02, (Doubt("few_matches"),))
-    kept = _ScoredModel(empty, {"a": Confidence(0.9, ())}, {"b": other})
-    dropped = _ScoredModel(empty, {}, {"a": wrong, "b": wrong, "c": wrong})
+    kept = ScoredModel(empty, {"a": Confidence(0.9, ())}, {"b": other})
+    dropped = ScoredModel(empty, {}, {"a": wrong, "b": wrong, "c": wrong})
     _pass_on_reasons([kept, dropped], [kept])
     assert kept.taken_out == {"b": other, "c": wrong}
     _pass_on_reasons([dropped], [])

@@ -27,9 +27,10 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.groups import with_places_mapped_again
-from colmap_affrect.mappers.mapping import _no_surer_than_ties, map_database
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
+from colmap_affrect.mappers.scored_models import no_surer_than_ties
 from colmap_affrect.mappers.surroundings import (
     CLUMP,
     Overlap,
@@ -39,6 +40,7 @@ from colmap_affrect.mappers.surroundings import (
     known_places,
     places_of,
 )
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import DOUBTFUL, Bridge, ModelSummary
 
 NUM_POINTS = 3000
@@ -160,10 +162,29 @@ def test_bridged_photograph_is_no_surer_than_what_it_hangs_on(tmp_path: Path) ->
     ties = {f"{number}.jpg": Confidence(0.3, ()) for number in range(5)}
     alone = {**ties, "5.jpg": Confidence(0.95, ())}
     held = {**alone, "3.jpg": Confidence(0.97, ())}
-    found = _no_surer_than_ties(alone, mapped, task)
+    found = no_surer_than_ties(alone, mapped, task)
     assert found["5.jpg"].probability == 0.3
     assert found["5.jpg"].reasons[0].code == "hangs_on"
-    assert _no_surer_than_ties(held, mapped, task) == held
+    held_up = no_surer_than_ties(held, mapped, task)
+    assert held_up["5.jpg"].probability == 0.95
+    assert held_up["3.jpg"].probability == 0.95  # alone sure, it would mean nothing
+
+
+def test_one_photograph_alone_is_no_surer_than_the_surest_that_ties_it(
+    tmp_path: Path,
+) -> None:
+    """What is sure is where two stand to each other."""
+    path = tmp_path / "database.db"
+    mapped = MappedModel(scene(path, everything))
+    given = {f"{number}.jpg": Confidence(0.1 * number, ()) for number in range(6)}
+    given["5.jpg"] = Confidence(0.95, (Doubt("few_matches"),))
+    found = no_surer_than_ties(given, mapped, task_with_given_cameras(path))
+    assert found["5.jpg"].probability == 0.4
+    codes = [doubt.code for doubt in found["5.jpg"].reasons]
+    assert codes == ["hangs_on", "few_matches"]
+    assert found["5.jpg"].reasons[0].values == {"other": "4.jpg", "percent": 40}
+    others = {name: one for name, one in given.items() if name != "5.jpg"}
+    assert {name: found[name] for name in others} == others
 
 
 def test_photograph_hangs_on_what_the_one_it_hangs_on_hangs_on(tmp_path: Path) -> None:
@@ -173,7 +194,7 @@ def test_photograph_hangs_on_what_the_one_it_hangs_on_hangs_on(tmp_path: Path) -
     mapped = MappedModel(scene(path, everything), bridges)
     given = {f"{number}.jpg": Confidence(0.3, ()) for number in range(4)}
     given |= {"4.jpg": Confidence(0.9, ()), "5.jpg": Confidence(0.95, ())}
-    found = _no_surer_than_ties(given, mapped, task_with_given_cameras(path))
+    found = no_surer_than_ties(given, mapped, task_with_given_cameras(path))
     assert [found[name].probability for name in sorted(found)] == [0.3] * 6
     for name in bridges:
         assert found[name].reasons[0].code == "hangs_on"

@@ -245,3 +245,16 @@ def test_long_lists_end_where_the_screen_does() -> None:
 ])  # fmt: skip
 def test_stage_summary_is_one_line(stage: StageReport, line: str) -> None:
     assert stage.summary() == line
+
+
+def test_without_a_model_the_headline_says_why_the_one_that_pairs_make_was_wrong() -> (
+    None
+):
+    few = (Doubt("few_matches"), Doubt("focal_unknown"))
+    wrong = Missing("wrong_model", doubts=few)
+    other = Missing("wrong_model", doubts=(Doubt("matches_disagree"),))
+    unregistered = {"a": wrong, "b": other, "c": wrong, "d": Missing("not_registered")}
+    report = replace(REPORT, models=(), unregistered=unregistered, stages=())
+    why = Doubt("few_matches").text()
+    headline = "no model is kept: that of 3 photographs was surely wrong"
+    assert report.why_no_model == f"{headline}: {why}"

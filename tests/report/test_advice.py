@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import project
-from colmap_affrect.report.advice import shows_depth
+from colmap_affrect.mappers.wrong_models import ThrownAway, write_thrown_away
+from colmap_affrect.project.reasons import Doubt
+from colmap_affrect.report import advice
+from colmap_affrect.report.advice import (
+    ENOUGH,
+    _any_shows_depth,
+    _why_no_model,
+    shows_depth,
+)
 
 SIZE_PX = 1000.0
 TURN = np.array([[0.98, 0.03, 12.0], [-0.02, 1.01, 5.0], [2e-5, -3e-5, 1.0]])
@@ -39,3 +51,38 @@ def test_few_wrong_matches_of_a_short_list_show_no_depth() -> None:
     first, second = turned(120)
     second[:10, 0] += 30.0
     assert not shows_depth(first, second, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("doubts", "why"),
+    [
+        ((Doubt("few_matches"), Doubt("focal_unknown")), "too few agree on one model"),
+        ((Doubt("matches_disagree"),), "contradict each other"),
+        ((), "contradict each other"),
+    ],
+)
+def test_where_no_model_is_kept_what_its_photographs_lacked_is_advised(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    doubts: tuple[Doubt, ...],
+    why: str,
+) -> None:
+    monkeypatch.setattr(advice, "_any_shows_depth", lambda _: True)
+    if doubts:
+        write_thrown_away(ThrownAway({"a": doubts}), tmp_path)
+    context: Any = SimpleNamespace(workspace=SimpleNamespace(sparse=tmp_path))
+    assert _why_no_model(context).endswith(why)
+
+
+def test_one_of_the_strongest_pairs_that_shows_depth_is_enough(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = np.zeros((ENOUGH, 2), int)
+    flat = {("a", "b"): np.zeros((300, 2), int), ("a", "c"): rows}
+    graph = SimpleNamespace(inliers=lambda _: flat)
+    context: Any = SimpleNamespace(graph=graph)
+    shown = {("a", "b"): False, ("a", "c"): True}
+    monkeypatch.setattr(advice, "_pair_shows_depth", lambda _, names, __: shown[names])
+    assert _any_shows_depth(context)
+    shown["a", "c"] = False
+    assert not _any_shows_depth(context)

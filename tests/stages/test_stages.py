@@ -291,7 +291,7 @@ def test_strong_pairs_that_make_no_model_contradict_each_other_or_show_no_depth(
     shows_depth: bool,
 ) -> None:
     found_depth = Mock(return_value=shows_depth)
-    monkeypatch.setattr(advice_module, "_strongest_shows_depth", found_depth)
+    monkeypatch.setattr(advice_module, "_any_shows_depth", found_depth)
     (found,) = advice(adviser.context, [*NAMES], [], 900)
     assert why in found.why
 
