@@ -123,6 +123,7 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
     context: Any = state.context
     context.resources = SimpleNamespace(usable_levels=lambda _: [0, 1, 3])
     context.features.image_sizes = dict
+    context.workspace.sparse = Path("none")
     context.usable = lambda _: []
     context.num_verified_inliers = dict
     context.matches = SimpleNamespace(

@@ -169,7 +169,7 @@ def test_few_matches_that_chance_explains_are_sure_where_third_images_confirm_th
 ) -> None:
     path = tmp_path / "database.db"
     targets(path, 8)
-    monkeypatch.setattr(few_matches, "significance", lambda *_: -20.0)
+    monkeypatch.setattr(few_matches, "significance", lambda *_, **__: -20.0)
     assert len(sure_ids(path)) == 10
 
 
