@@ -74,6 +74,13 @@ def test_is_inside_accepts_whole_pixels_up_to_their_outer_edge() -> None:
     ]
 
 
+def test_points_keep_a_margin_of_their_own_in_x_and_y() -> None:
+    points = np.array([[1.0, 1.0]] * 4 + [[3.0, 1.0]] * 4)
+    margins = np.array([[1.4, 1.4], [1.6, 1.4], [1.4, 1.6], [0.0, 0.0]] * 2)
+    expected = [True, False, False, True]
+    assert is_inside(points, (5, 3), margins).tolist() == expected * 2
+
+
 @pytest.mark.parametrize(
     ("direction", "angle_deg"),
     [((1, 0), 0.0), ((0, 1), 90.0), ((-1, 0), 180.0), ((0, -1), -90.0)],

@@ -10,7 +10,9 @@ fails. What was tried is written after each number, and is not tried again when 
 repeated.
 
 With `--changes` other changes are tried in their place, those of a file: a JSON list of objects
-with `module`, `before` and `after`, a text that the module has once, and what it becomes.
+with `module`, `before` and `after`, a text that the module has once, and what it becomes. Those of
+`tests/benchmarks/changes.json` were tried in November 2026: each fails some test. What the code
+does not have any more is passed over.
 """
 
 from __future__ import annotations
@@ -277,9 +279,15 @@ def mutations(folders: list[str]) -> Iterator[WrongNumber]:
 
 
 def replacements(path: Path) -> Iterator[Replacement]:
-    """Yield the changes of a file."""
+    """Yield the changes of a file, but for those of what the code does not have any more."""
     for row in json.loads(path.read_text(encoding="utf-8")):
-        yield Replacement(row["module"], row["before"], row["after"])
+        change = Replacement(row["module"], row["before"], row["after"])
+        try:
+            change.text()
+        except ValueError as error:
+            print(f"passed over: {error}")
+            continue
+        yield change
 
 
 def main() -> None:

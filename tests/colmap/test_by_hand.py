@@ -215,3 +215,28 @@ def test_matches_below_a_painted_mask_are_left_out_and_verified_anew(
     digest = by_hand.digest()
     write_image(tmp_path / "masks" / "a.png.png", 255 - mask)
     assert by_hand.digest() != digest
+
+
+def test_photographs_that_are_left_out_get_no_tie_points(
+    tmp_path: Path, database: Path
+) -> None:
+    table = tmp_path / "marks.csv"
+    table.write_text("p,a,1,2\np,b,3,4\np,c,5,6\n", encoding="utf-8")
+    by_hand = ByHand(tie_points_path=table, left_out=("b.jpg",))
+    found = by_hand.copy_database(database, tmp_path / "mapped.db")
+    assert found["p"].keys() == {"old/a.jpg", "c.png"}
+
+
+def test_what_is_said_differs_by_pairs_and_by_photographs_and_not_by_their_order() -> (
+    None
+):
+    said = [
+        ByHand(),
+        ByHand(left_out=("a.jpg",)),
+        ByHand(left_out=("b.jpg",)),
+        ByHand(rejected=(("a.jpg", "b.jpg"),)),
+        ByHand(rejected=(("a.jpg", "c.jpg"),)),
+    ]
+    assert len({one.digest() for one in said}) == len(said)
+    both = ByHand(left_out=("a.jpg", "b.jpg"))
+    assert both.digest() == ByHand(left_out=("b.jpg", "a.jpg")).digest()

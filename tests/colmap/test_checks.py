@@ -5,16 +5,23 @@ from __future__ import annotations
 import random
 import sqlite3
 import struct
+from collections import defaultdict
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from damaged import Statement, execute
 from mapping_tasks import write_images
 
-from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import check_database, refuse_unusable
+from colmap_affrect.colmap import checks, pycolmap
+from colmap_affrect.colmap.checks import (
+    check_database,
+    keypoint_problems,
+    refuse_unusable,
+)
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
@@ -329,3 +336,36 @@ def test_damaged_file_is_a_database_error_or_problems(
             errors.append(str(error).startswith(f"{path}: "))
     assert len(errors) > 10
     assert all(errors)
+
+
+def test_places_that_less_than_half_of_the_keypoints_are_at_are_no_problem() -> None:
+    """Twelve or twenty of 41 keypoints are in the middle, and as many on each side of it."""
+    for num_there, is_problem in ((12, False), (20, False), (21, True)):
+        left = np.linspace(10.0, 90.0, (41 - num_there) // 2)
+        right = np.linspace(110.0, 190.0, 41 - num_there - len(left))
+        columns = np.concatenate([left, np.full(num_there, 100.0), right])
+        keypoints = np.stack([columns, columns], axis=1).astype(np.float32)
+        found = keypoint_problems(keypoints, (200, 200))
+        assert found == (["keypoints-at-one-place"] if is_problem else [])
+
+
+@pytest.mark.parametrize(("num_keypoints", "is_problem"), [(90, False), (110, True)])
+def test_few_keypoints_may_be_in_a_corner(
+    num_keypoints: int, *, is_problem: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(1)
+    rows = []
+    for image_id in (1, 2, 3):
+        keypoints = rng.uniform(0.0, 90.0, (num_keypoints, 2)).astype("<f4")
+        rows.append((image_id, num_keypoints, 2, keypoints.tobytes()))
+    monkeypatch.setattr(checks, "rows_of", lambda *_: rows)
+    camera = SimpleNamespace(width=200, height=200)
+    tables: Any = SimpleNamespace(
+        names={1: "a", 2: "b", 3: "c"},
+        camera_ids={1: 1, 2: 1, 3: 1},
+        cameras={1: camera},
+    )
+    found = defaultdict[str, list[str]](list)
+    connection: Any = None
+    checks._check_keypoints(connection, tables, found)
+    assert found == ({"keypoints-in-a-corner": ["a", "b", "c"]} if is_problem else {})

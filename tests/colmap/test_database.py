@@ -110,6 +110,13 @@ def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> Non
     assert_allclose(keypoints, [[10.5, 20.5, 2.0, -1.0, 0.5, 3.0]])
 
 
+def test_intrinsics_are_in_pixels_whose_first_one_is_at_zero() -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 900.0, 1000, 700)
+    camera.principal_point_y = 320.0
+    expected = [[900.0, 0.0, 499.5], [0.0, 900.0, 319.5], [0.0, 0.0, 1.0]]
+    assert_allclose(colmap_database.camera_matrix(camera), expected)
+
+
 def test_keypoints_that_are_there_stay_unless_escalation_has_extended_them(
     database_path: Path,
 ) -> None:

@@ -225,3 +225,42 @@ def test_an_image_that_verified_pairs_did_not_save_is_less_likely_saved_by_anoth
     assert rate(tied_twice, "ab") == pytest.approx(
         rate(lost) / 2
     )  # c is not in the model
+
+
+def test_a_pair_is_strong_from_a_hundred_inliers_on() -> None:
+    pairs = {"ab": 200, "ac": 100, "bc": 99}
+    assert chosen(planner(pairs, {"c": 1.0}, registered="ab")) == ["bc"]
+
+
+def test_measured_levels_are_as_likely_as_the_best_measured_matches_say() -> None:
+    """Learned matches took the place of measured ones, of which five were consistent."""
+    state = PairState(90, 40, level=2, tried=0b101, measured_worth=(0, 5))
+    of_pair = {("a", "b"): state}
+    sizes = {"a": 1.0, "b": 1.0}
+    found = StepPlanner(of_pair, set(), {"b": 1.0}, sizes, [2, 4], (), "a", 100)
+    (by_measured,) = found.candidates(1, COVERS, 0b1010)
+    expected = statistics_of(COVERS).chance(terms(PairState(0, 5, tried=0b101), 0, 0))
+    assert by_measured.chance == pytest.approx(expected)
+    (by_learned,) = found.candidates(4, LEVELS[4], 0b10000)
+    expected = statistics_of(LEVELS[4]).chance(terms(state, 0, 0))
+    assert by_learned.chance == pytest.approx(expected)
+
+
+def test_mapping_after_a_step_does_not_count_against_the_budget() -> None:
+    pairs = planner(INLIERS, {"d": 1.0}, {"ad": 7, "bd": 8, "cd": 6})
+    step = best(pairs, budget_s=1.01 * statistics_of(COVERS).pair_s)
+    assert step.num_pairs == 1
+
+
+def test_pairs_come_by_the_photographs_that_they_save_and_not_by_their_chances() -> (
+    None
+):
+    pairs = planner({"ab": 200, "ad": 0, "ae": 0}, {"d": 0.1, "e": 1.0}, {"ad": 9})
+    candidates = pairs.candidates(1, COVERS, 0b10)
+    assert ["".join(one.pair) for one in candidates] == ["ae", "ad"]
+    assert candidates[0].chance < candidates[1].chance
+
+
+def test_verified_pairs_with_images_of_the_model_are_counted_by_image() -> None:
+    found = planner(INLIERS, {"d": 1.0})._num_pairs_to_model
+    assert found == {"a": 2, "b": 2, "c": 2, "e": 1}

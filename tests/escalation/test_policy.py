@@ -123,6 +123,27 @@ def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> N
     )
 
 
+def test_learned_matching_of_a_large_set_has_the_time_that_it_has_not_taken_yet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names, weights=names)
+    states = dict(large.states)
+    states[names[0], names[1]] = PairState(0, 3, tried=1 | 1 << LEARNED)
+    large = replace(large, states=states)
+    asked = dict[str, float]()
+
+    def best_step(_: Situation, number: int, budget_s: float) -> Step:
+        asked[kind_of(LEVELS[number])] = budget_s
+        return Step()
+
+    monkeypatch.setattr(Situation, "best_step", best_step)
+    learned_step(large)
+    statistics = statistics_of(LEVELS[LEARNED])
+    spent_s = 2 * statistics.image_s + statistics.pair_s
+    assert asked == {"learned": pytest.approx(large.first_model_s - spent_s)}
+
+
 def done_with_learned(**given: Any) -> Situation:
     """All pairs were matched by networks, beside what is there."""
     before = situation(**given)
@@ -148,6 +169,15 @@ def test_learned_level_of_a_large_set_is_a_step_of_its_own() -> None:
     assert next_step(situation(names, weights=names), "low").step.level == LEARNED
 
 
+def test_learned_level_of_a_large_set_may_take_what_the_first_model_took() -> None:
+    names = [f"{number:03}" for number in range(SMALL + 1)]
+    large = situation(names, weights=names)
+    spent = dict.fromkeys(large.states, PairState(0, 3, tried=0b1001))
+    plan = next_step(replace(large, states=spent), "low")
+    assert plan.step.level == LEARNED
+    assert plan.left_s == pytest.approx(large.first_model_s)
+
+
 def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one() -> (
     None
 ):
@@ -155,6 +185,7 @@ def test_budget_is_a_least_time_or_that_of_the_first_model_and_more_without_one(
     assert normal.budget_s(1.0, has_model=True) == normal.least_s == 120.0
     assert normal.budget_s(1000.0, has_model=True) == 1000.0
     assert normal.budget_s(1.0, has_model=False) == normal.without_model_s == 900.0
+    assert normal.budget_s(1000.0, has_model=False) == 1000.0
     times = [
         EFFORTS[name].budget_s(1000.0, has_model=True)
         for name in ("low", "normal", "high")
@@ -224,3 +255,38 @@ def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
     assert "learned" not in kinds
     assert kinds["measured, all tilts"].num_pairs == 7
     assert kinds["measured, all tilts"].core_s > 0.0
+
+
+@pytest.mark.parametrize(
+    ("number", "needless_after"), [(1, [1, 3]), (2, [2, 4]), (3, [3]), (4, [4])]
+)
+def test_a_level_is_needless_after_itself_and_later_ones_with_frames_as_its_own(
+    number: int, needless_after: list[int]
+) -> None:
+    """Frames of the first and the third level are measured, those of the others learned."""
+    bits = sum(1 << later for later in needless_after)
+    assert situation().needless_after(number) == bits
+
+
+def test_the_level_that_saves_most_photographs_per_second_comes_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pairs = [("a", "d")]
+    steps = {
+        1: Step(1, pairs, 2.0, 50.0, all_photographs=2.0, all_seconds=60.0),
+        2: Step(2),
+        3: Step(3, pairs, 1.0, 10.0, all_photographs=1.0, all_seconds=25.0),
+        4: Step(4, pairs, 9.0, 1.0, all_photographs=0.1, all_seconds=7.0),  # no hope
+    }
+
+    def best_step(_: Situation, number: int, budget_s: float) -> Step:
+        assert budget_s == 120.0
+        return steps[number]
+
+    monkeypatch.setattr(Situation, "best_step", best_step)
+    plan = next_step(situation(), "normal")
+    assert plan.step is steps[3]
+    assert plan.left_s == 85.0
+    slow = replace(steps[1], all_seconds=1000.0)
+    monkeypatch.setitem(steps, 1, slow)
+    assert next_step(situation(), "normal").left_s == 120.0

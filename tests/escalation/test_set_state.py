@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from colmap_affrect.escalation import set_state
 from colmap_affrect.escalation.escalate import Trial
 from colmap_affrect.escalation.expected_gain import (
     Candidate,
@@ -59,6 +61,100 @@ def test_an_image_that_is_likely_right_weighs_a_quarter_of_what_it_may_gain() ->
     assert weights == pytest.approx(
         {"doubtful.jpg": 0.8, "likely.jpg": 0.05, "missing.jpg": 1.0}
     )
+
+
+def test_what_the_largest_model_is_sure_of_weighs_nothing_and_others_count_as_likely() -> (
+    None
+):
+    largest = ModelSummary(
+        registered_names=("sure.jpg",),
+        num_points3D=90,
+        mean_track_length=3.0,
+        mean_reprojection_error_px=0.5,
+        probabilities={"sure.jpg": SURE},
+    )
+    other = ModelSummary(
+        registered_names=("likely.jpg",),
+        num_points3D=90,
+        mean_track_length=3.0,
+        mean_reprojection_error_px=0.5,
+        probabilities={"likely.jpg": SURE},
+    )
+    names = ["likely.jpg", "missing.jpg", "sure.jpg"]
+    weights = state_of(names, left_out=()).weights([largest, other])
+    assert weights == {"likely.jpg": 0.25, "missing.jpg": 1.0}
+
+
+def test_matches_are_looked_at_again_where_they_are_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    state = state_of(NAMES, ())
+    matches = np.zeros((4, 2), np.uint32)
+    database = SimpleNamespace(read_matches=lambda *_: matches)
+    context: Any = state.context
+    context.graph = SimpleNamespace(
+        ids={"a": 1, "b": 2}, open_to_read=lambda: nullcontext(database)
+    )
+    looked_at = list[int]()
+
+    def num_confirming(_: object, __: object, indices: np.ndarray) -> int:
+        looked_at.append(len(indices))
+        return 10 * len(indices)
+
+    monkeypatch.setattr(set_state, "num_confirming", num_confirming)
+    assert state._num_confirming([("a", "b")]) == {("a", "b"): 40}
+    assert state._num_confirming([("a", "b")]) == {("a", "b"): 40}
+    matches = np.zeros((7, 2), np.uint32)
+    assert state._num_confirming([("a", "b")]) == {("a", "b"): 70}
+    assert looked_at == [4, 7]
+
+
+def test_images_lack_levels_and_those_of_another_recipe_do_not_count() -> None:
+    state = state_of(NAMES, ())
+    context: Any = state.context
+    context.extraction = SimpleNamespace(levels=[None, None, None])
+    of_images = {"a": {0: (0, 9), 1: (9, 20)}, "b": {0: (0, 9), 3: (9, 20)}}
+    context.features.level_ranges = of_images.get
+    assert state._lacking_by_level(["a", "b"]) == [set(), {"b"}, {"a", "b"}]
+
+
+def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
+    state = state_of(["a", "b"], ())
+    context: Any = state.context
+    context.resources = SimpleNamespace(usable_levels=lambda _: [0, 1, 3])
+    context.features.image_sizes = dict
+    context.workspace.sparse = Path("none")
+    context.usable = lambda _: []
+    context.num_verified_inliers = dict
+    context.matches = SimpleNamespace(
+        levels=lambda *_: {},
+        measured_worths=lambda _: {},
+        learned_levels=lambda _: {},
+    )
+    found = state.situation({}, one_model())
+    assert list(found.usable) == [1, 3]
+    assert found.registered == ("a",)
+
+
+def one_model() -> list[ModelSummary]:
+    """Return one model of one image."""
+    return [
+        ModelSummary(
+            registered_names=("a",),
+            num_points3D=90,
+            mean_track_length=3.0,
+            mean_reprojection_error_px=0.5,
+        )
+    ]
+
+
+def test_two_images_are_never_weakly_connected() -> None:
+    for names, weak in ((["a", "b"], set[str]()), (["a", "b", "c"], {"a", "b"})):
+        state = state_of(names, ())
+        context: Any = state.context
+        context.guiding = SimpleNamespace(min_num_tracks=30)
+        context.verified_inliers = lambda: {("a", "b"): np.zeros((9, 2), np.int64)}
+        assert state._weakly_connected() == weak
 
 
 def test_inliers_of_a_pair_are_found_whichever_image_is_the_first() -> None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 from strategies import Array
 from synthetic import texture
 
@@ -108,3 +109,26 @@ def test_block_tensors_are_means_of_products_of_gradients() -> None:
     found = _block_tensors(image, 1.5)
     assert found.dtype == np.float32
     assert_allclose(found, blocks, rtol=1e-4, atol=1e-3)
+
+
+def textured_blocks(row: Array) -> NDArray[np.bool_]:
+    """Return which blocks have texture in an image of which all rows are as one is."""
+    image = np.tile(np.rint(row), (64, 1)).astype(np.uint8)
+    return SecondMoment(SecondMomentOptions()).grid(image).textured[8]
+
+
+@pytest.mark.parametrize(("amplitude", "has_texture"), [(8.0, False), (100.0, True)])
+def test_stripes_of_four_pixels_are_smoothed_to_a_sixteenth(
+    amplitude: float, *, has_texture: bool
+) -> None:
+    stripes = 128.0 + amplitude * np.cos(0.5 * np.pi * np.arange(120.0))
+    assert (textured_blocks(stripes) == has_texture).all()
+
+
+def test_texture_is_seen_some_pixels_beside_it() -> None:
+    """The left part of the image has stripes, up to the column 100."""
+    columns = np.arange(400.0)
+    stripes = 128.0 + 100.0 * np.cos(columns * np.pi / 8.0) * (columns < 100.0)
+    textured = textured_blocks(stripes)
+    assert textured[: 112 // STEP_PX].all()
+    assert not textured[200 // STEP_PX :].any()

@@ -137,3 +137,11 @@ def test_neighbors_within_equals_all_distances(points: Array, radius: float) -> 
         for begin, end in zip(lists.starts[:-1], lists.starts[1:], strict=True)
     ]
     assert actual == all_neighbors(points, radius)
+
+
+def test_right_pairs_agree_more_often_than_chance_where_that_agrees_often() -> None:
+    """The ratio is anything from that of chance, which is above a half, to all."""
+    steps = 0.8 + 0.2 * np.arange(50) / 50.0
+    factors = (steps / 0.8) ** 18 * ((1.0 - steps) / 0.2) ** 2
+    expected = math.log10(factors.mean())
+    assert log10_bayes_factor(20, 18, 0.8) == pytest.approx(expected)

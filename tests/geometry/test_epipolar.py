@@ -10,6 +10,7 @@ from colmap_affrect.geometry.epipolar import (
     EpipolarModel,
     common_sign,
     epipolar_lines,
+    rotation_cosines,
     sampson_errors,
 )
 
@@ -101,3 +102,11 @@ def test_true_frames_carry_the_epipolar_direction_of_image_1_to_that_of_image_2(
     assert np.degrees(np.arccos(np.clip(wrong * sign, -1, 1))).min() > 10.0
     swapped = cosines_of(F.T, points[::-1], shapes[::-1])
     np.testing.assert_allclose(np.abs(swapped), 1.0, atol=1e-6)
+
+
+def test_frames_that_are_mirrored_alike_are_turned_as_others_are() -> None:
+    turn = rotation((0.0, 0.0, 30.0))[:2, :2]
+    frames = np.array([[[2.0, 0.3], [0.1, 1.5]], [[2.0, 0.3], [-0.1, -1.5]]])
+    cosines = rotation_cosines(frames, turn @ frames)
+    assert cosines == pytest.approx([np.cos(np.deg2rad(30.0))] * 2)
+    assert rotation_cosines(frames, frames[::-1]).tolist() == [-1.0, -1.0]

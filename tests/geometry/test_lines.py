@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from line_scenes import SIZE, Building, arch_edges, chance_edges, turn
@@ -14,6 +16,7 @@ from colmap_affrect.geometry.lines import (
     DISTORTIONS,
     FOCALS,
     SHIFTS,
+    Explanation,
     LineCamera,
     LineLikelihood,
     Lines,
@@ -297,3 +300,50 @@ def test_up_is_the_row_nearest_to_the_images_upright() -> None:
     rotation = np.stack([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])
     assert_allclose(upright_of(rotation), [0.0, -0.8, 0.6])
     assert_allclose(upright_of(-rotation), [0.0, -0.8, 0.6])
+
+
+def test_horizontal_directions_vanish_on_the_horizon() -> None:
+    """The camera looks down a little and rolls; its axis is above the middle."""
+    rotation = turn(0, 12.0) @ turn(1, 25.0) @ turn(2, 4.0)
+    explanation = Explanation(1.3, -0.15, rotation, np.zeros(0, np.int64), 9.0)
+    up = explanation.up
+    for direction in rotation:
+        if abs(direction @ up) > 0.5:
+            continue
+        x, y, z = direction
+        vanishing = np.array([1.3 * x, 1.3 * y - 0.15 * z, z])
+        assert explanation.horizon @ vanishing == pytest.approx(0.0, abs=1e-12)
+    assert (
+        explanation.horizon @ [0.0, -9.0, 1.0] > 0.0 > explanation.horizon @ [0, 9, 1]
+    )
+
+
+def test_segments_are_of_one_line_where_either_one_says_so() -> None:
+    """The middle of the second one is on the line of the first one, but not the other way."""
+    directions = np.array([[0.05, 0.0], [0.05 * np.cos(0.04), 0.05 * np.sin(0.04)]])
+    middles = np.array([[0.0, 0.0], [0.9, 0.005]])
+    segments = Segments(middles - directions, middles + directions)
+    assert_allclose(segments.weights, [0.5, 0.5])
+
+
+def test_focal_lengths_are_as_likely_as_all_distortions_make_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Segments err together: three nats of them count as one."""
+    turns = np.tile(np.eye(3), (len(FOCALS), 1, 1))
+    of_others = np.where(np.arange(len(FOCALS)) == 5, 6.0, 0.0)
+
+    def refined_at_once(*given: Any) -> tuple[Array, Array]:
+        return given[1], np.full(len(given[1]), 3.0)
+
+    monkeypatch.setattr(line_cameras, "refined", refined_at_once)
+    monkeypatch.setattr(
+        line_cameras,
+        "_likeliest_lens",
+        lambda *_: line_cameras._Lens(0.0, turns, of_others),
+    )
+    edges = np.array([[10.0, 10.0, 10.0, 20.0 + number] for number in range(20)])
+    found = line_cameras.line_likelihood(Segments.of_image(edges, SIZE))
+    assert found is not None
+    assert_allclose(found.log_likelihoods[5], 3.0)
+    assert_allclose(np.delete(found.log_likelihoods, 5, axis=0), 1.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry import parallax
 from colmap_affrect.geometry.affine import project, rotation
 from colmap_affrect.geometry.arrays import Array, Bytes
@@ -14,6 +15,7 @@ from colmap_affrect.geometry.parallax import (
     Size,
     correlation,
     mirrored_share,
+    pure_rotation_ratio,
     same_view_homography,
     text_line_matches,
 )
@@ -148,3 +150,31 @@ def test_medians_are_those_of_numpy() -> None:
     rows = np.random.default_rng(0).normal(size=(5, 8))
     assert_allclose(parallax._medians(rows), np.median(rows, axis=1))
     assert_allclose(parallax._medians(rows[:, 1:]), np.median(rows[:, 1:], axis=1))
+
+
+def test_a_camera_that_turns_and_zooms_may_have_images_of_two_sizes() -> None:
+    """Image 2 is larger, and of a lens that is one and a half times as long."""
+    sizes: tuple[Size, Size] = ((640, 480), (1000, 900))
+    focal_px = 0.63 * 640.0
+    x, y = np.meshgrid(np.linspace(60, 580, 15), np.linspace(40, 440, 13))
+    points1 = np.stack([x.ravel(), y.ravel()], axis=1)
+    rays = np.column_stack([(points1 - (320, 240)) / focal_px, np.ones(len(points1))])
+    roll = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.3]))
+    turn = pycolmap.Rotation3d(np.array([0.2, 0.0, 0.0])) * roll
+    turned = rays @ turn.matrix().T
+    points2 = 1.5 * focal_px * turned[:, :2] / turned[:, 2:] + (500, 450)
+    assert pure_rotation_ratio(points1, points2, sizes, 4.0) > 0.9
+    wrong = np.random.default_rng(6).permutation(points2)
+    assert pure_rotation_ratio(points1, wrong, sizes, 4.0) < 0.3
+
+
+def test_where_one_image_shows_nothing_windows_do_not_correlate() -> None:
+    """Two thirds of the second image are painted over."""
+    random = np.random.default_rng(5)
+    rough = random.uniform(0, 255, (40, 60)).astype(np.uint8)
+    gray = cv2.resize(rough, (300, 200), interpolation=cv2.INTER_LINEAR)
+    painted = gray.copy()
+    painted[:, 100:] = 128
+    assert correlation(gray, gray, np.eye(3)) > 0.9
+    assert correlation(gray, painted, np.eye(3)) < 0.2
+    assert correlation(painted, gray, np.eye(3)) < 0.2

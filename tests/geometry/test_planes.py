@@ -16,6 +16,7 @@ from colmap_affrect.geometry.planes import (
     fronto_parallel_homography,
     normals_from_depth,
     shrink_depth,
+    spiral_points,
     viewing_cosines,
 )
 
@@ -182,3 +183,69 @@ def test_fronto_parallel_homography_turns_no_further_than_needed() -> None:
     upright = project(homography, np.array([[61.0, 3.0], [61.0, 33.0], [61.0, 66.0]]))
     assert_allclose(upright[:, 0], upright[0, 0])
     assert (np.diff(upright[:, 1]) > 0).all()
+
+
+def weighted_normal(inverse: Array, row: int, column: int) -> Array:
+    """Return the normal of a pixel by weighted least squares in its window of 5 x 5 px."""
+    ray_from_pixel = np.linalg.inv(CAMERA)
+    rows = []
+    changes = []
+    roots = []
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            change = inverse[row + dy, column + dx] / inverse[row, column] - 1.0
+            ray_change = np.linalg.norm(ray_from_pixel @ [dx, dy, 0.0])
+            if abs(change) <= ray_change / np.cos(np.deg2rad(85.0)):
+                rows.append([dx, dy, 1.0])
+                changes.append(1.0 + change)
+                roots.append(np.exp(-(dx * dx + dy * dy) / (4.0 * 0.8**2)))
+    weights = np.array(roots)
+    form, *_ = np.linalg.lstsq(
+        weights[:, None] * np.array(rows), weights * np.array(changes), rcond=None
+    )
+    a, b, c = form
+    of_rays = np.array([a, b, c - a * column - b * row]) @ CAMERA
+    return unit(-of_rays)
+
+
+def test_normals_of_rough_surfaces_are_weighted_least_squares_without_far_neighbours() -> (
+    None
+):
+    """Depth differs by some per cent, so that a part of the neighbours is left out."""
+    rough = np.random.default_rng(3).normal(1.0, 0.03, (70, 90))
+    depth = plane_depth(np.array([0.3, -0.4, -0.8])) * rough
+    normals = normals_from_depth(depth, CAMERA)
+    for row, column in ((30, 40), (31, 40), (50, 20), (10, 70)):
+        if np.isfinite(normals[row, column]).all():
+            assert_allclose(
+                normals[row, column], weighted_normal(1.0 / depth, row, column)
+            )
+    assert np.isfinite(normals[30:32, 40]).any()
+
+
+def test_normals_are_taken_away_that_are_near_the_mean_direction() -> None:
+    """They are not near the candidate that was chosen first, which is 20 degrees off."""
+    candidates = spiral_points(10)
+    cosines = candidates @ candidates[4]
+    neighbor = np.argsort(-cosines)[1]
+    angle = np.arccos(cosines[neighbor])
+    across = unit(candidates[neighbor] - cosines[neighbor] * candidates[4])
+
+    def at_deg(degrees: float) -> Array:
+        radians = np.deg2rad(degrees)
+        return np.cos(radians) * candidates[4] + np.sin(radians) * across
+
+    assert np.deg2rad(55.0) < angle < np.deg2rad(75.0)
+    normals = np.concatenate(
+        [np.tile(at_deg(20.0), (100, 1)), np.tile(at_deg(45.0), (60, 1))]
+    )
+    found = cluster_normals(
+        normals[None],
+        num_candidates=10,
+        bin_angle_rad=np.deg2rad(30.0),
+        min_separation_rad=np.deg2rad(20.0),
+        max_num_planes=3,
+        min_votes_frac=0.1,
+    )
+    assert len(found.normals) == 1
+    assert (found.labels == 0).all()

@@ -7,6 +7,7 @@ import pytest
 
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.stationary import (
+    means_of_regions,
     num_moving_together,
     stationary_log_ratios,
 )
@@ -89,3 +90,18 @@ def test_motions_of_one_object_differ_by_less_than_half_of_the_distance() -> Non
     places = points(200) / 5.0
     assert num_moving_together(places, 0.2 * places, 20.0) > 180
     assert num_moving_together(places, 0.9 * places, 20.0) == 0
+
+
+def test_values_are_averaged_over_cells_that_are_connected() -> None:
+    """Two cells in the second column and below are neighbours; the third one is apart."""
+    cells = np.array([[1, 5], [2, 6], [7, 0]])
+    values = np.array([1.0, 3.0, 10.0])
+    assert means_of_regions(cells, values, 9, 1).tolist() == [2.0, 2.0, 10.0]
+
+
+def test_of_many_matches_some_are_looked_at_and_speak_for_all() -> None:
+    places = np.stack([2.0 * np.arange(900), np.zeros(900)], axis=1)
+    together = np.zeros((900, 2))
+    assert num_moving_together(places, together, 10.0) == 900
+    apart = 100.0 * np.random.default_rng(4).uniform(size=(900, 2))
+    assert num_moving_together(places, apart, 10.0) < 90

@@ -239,3 +239,18 @@ def test_blocks_of_metrics_change_no_ball() -> None:
     in_ball = _in_balls(centers, metrics, threshold)
     assert 0 < in_ball[:, -5:].sum() < in_ball[:, -5:].size
     np.testing.assert_array_equal(in_ball, cosh_distances(centers, metrics) < threshold)
+
+
+def test_shapes_without_a_tilt_are_covered_from_the_start() -> None:
+    """Of a hundred shapes 97 or 90 are not tilted, and 95 are to be covered."""
+    for num_tilted, num_centers in ((3, 0), (10, 1)):
+        tilts = np.repeat([1.0, 4.0], [100 - num_tilted, num_tilted])
+        cover = cover_shapes(
+            metrics_from_tilts(tilts, np.full(100, 0.5)),
+            np.ones(100),
+            radius=RADIUS,
+            max_tilt=5.8,
+            covered_frac=0.95,
+            max_num_centers=8,
+        )
+        assert len(cover.centers) == num_centers

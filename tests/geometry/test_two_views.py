@@ -178,3 +178,28 @@ def test_depths_beyond_the_nearest_do_not_make_a_scale_by_chance() -> None:
     found = scale_between((known, known_depths), (places, np.ones(300)), 100.0)
     assert found is not None
     assert found.share < 0.4
+
+
+def test_depths_beside_a_feature_count_more_than_those_at_the_end_of_the_radius() -> (
+    None
+):
+    """Two known depths are beside it, and three others nine tenths of the radius away."""
+    feature = np.array([[500.0, 400.0]])
+    offsets = np.array([[1.0, 0.0], [0.0, 1.0], [27.0, 0.0], [-27.0, 0.0], [0.0, 27.0]])
+    known = feature + offsets, np.array([2.0, 2.0, 3.0, 3.0, 3.0])
+    found = scale_between(known, (feature, np.ones(1)), 30.0)
+    assert found is not None
+    assert found.scale == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("error_frac", "is_plane"), [(0.01, True), (0.08, False)])
+def test_rough_surfaces_are_no_planes_although_their_middle_is_certain(
+    error_frac: float, *, is_plane: bool
+) -> None:
+    """Twelve depths around a feature are a little too large and too small in turn."""
+    angles = np.deg2rad(30.0 * np.arange(12))
+    around = 20.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1) + (500.0, 400.0)
+    in_turn = np.array([1.0, -1.0, 1.0, 1.0, -1.0, -1.0] * 2)
+    known = around, 5.0 / (1.0 + error_frac * in_turn)
+    found = scale_by_planes(known, (np.array([[500.0, 400.0]]), np.ones(1)), 30.0)
+    assert (found is not None) == is_plane

@@ -12,9 +12,15 @@ from wall_scene import views, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import Pose, pose_errors, relative_pose
+from colmap_affrect.geometry.two_views import ScaleEstimate
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.bridging import BridgeFinder, BridgeHypothesis
+from colmap_affrect.mappers.bridging import (
+    BridgeFinder,
+    BridgeHypothesis,
+    _OpenPair,
+    _PosedModel,
+)
 from colmap_affrect.mappers.camera_priors import camera_priors
 from colmap_affrect.mappers.growing import Grower, register_bridges
 from colmap_affrect.mappers.model_score import ModelScorer
@@ -130,6 +136,71 @@ def test_a_plane_around_features_tells_their_scale_up_to_an_eighth_of_the_image(
     assert (scale is not None) == is_told
     if scale:
         assert scale.scale == pytest.approx(2.5, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("of_large", "of_small", "weight"),
+    [(0.9, 0.3, 21.0), (0.4, 1.0, 18.0), (0.4, 0.6, None)],
+)
+def test_pairs_say_whether_a_bridge_is_right_by_the_roots_of_their_matches(
+    of_large: float, of_small: float, weight: float | None
+) -> None:
+    """Image 5 has a pair of 400 matches with the model, and one of 100 matches."""
+    shares = {(1, 5): of_large, (5, 7): of_small, (1, 7): 0.0}
+    pairs = []
+    for ids, num in (((1, 5), 400), ((5, 7), 100), ((1, 7), 900)):
+        pairs.append(SimpleNamespace(ids=ids, matches=np.zeros((num, 2))))
+    graph: Any = SimpleNamespace(
+        pairs_inside=lambda poses: pairs if poses.keys() == {1, 5, 7} else [],
+        agreement=lambda pair, *_: shares[pair.ids],
+    )
+    posed: Any = SimpleNamespace(poses={1: None, 7: None}, cameras={})
+    nothing: Any = None
+    finder = BridgeFinder(graph, nothing, SEED)
+    found = finder._agreeing_weight(posed, 5, nothing, nothing)
+    assert found == (None if weight is None else pytest.approx(weight))
+
+
+def test_a_bridge_ranks_by_the_pairs_and_the_depths_that_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph: Any = SimpleNamespace(names={1: "one.jpg"})
+    nothing: Any = None
+    finder = BridgeFinder(graph, nothing, SEED)
+    relative = SimpleNamespace(pose=(np.eye(3), np.array([1.0, 0.0, 0.0])))
+    scale = ScaleEstimate(2.0, num_agreeing=12, num_ratios=16, error_frac=0.01)
+    monkeypatch.setattr(finder, "_poses_of_pair", lambda *_: [relative])
+    monkeypatch.setattr(finder, "_scale", lambda *_: scale)
+    monkeypatch.setattr(finder, "_agreeing_weight", lambda *_: 8.0)
+    posed: Any = SimpleNamespace(
+        poses={1: (np.eye(3), np.array([0.0, 5.0, 0.0]))}, cameras={1: None}
+    )
+    pair: Any = SimpleNamespace(ids=(1, 5))
+    (found,) = finder._hypotheses(posed, _OpenPair(pair, 0, nothing))
+    assert found.rank == 8.0 * 12 / 16
+    assert found.image_id == 5
+    assert found.bridge == Bridge("one.jpg", 12, 16, 0.01)
+    assert found.pose[1].tolist() == [2.0, 5.0, 0.0]
+
+
+def test_points_behind_a_camera_have_no_known_depth() -> None:
+    """The camera is turned, and its depths are along its own axis."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 900.0, 1000, 700)
+    model.add_camera_with_trivial_rig(camera)
+    pose = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.6, -0.4, 0.2])), np.array([1.0, 2.0, 3.0])
+    )
+    pixels = np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])
+    image = pycolmap.Image("8.jpg", pixels, 1, 8)
+    model.add_image_with_trivial_frame(image, pose)
+    for index, depth in enumerate((5.0, -4.0, 7.0)):
+        track = pycolmap.Track()
+        track.add_element(8, index)
+        model.add_point3D(pose.inverse() * np.array([0.3, -0.2, depth]), track)
+    positions, depths = _PosedModel(model).known_depths(8)
+    assert positions.tolist() == [[10.0, 20.0], [50.0, 60.0]]
+    assert depths == pytest.approx([5.0, 7.0])
 
 
 def depths_of_wall(points_px: np.ndarray) -> np.ndarray:

@@ -182,3 +182,31 @@ def test_exif_and_given_focal_lengths_that_lines_contradict_are_named(
         found = focal_contradictions([camera()], {1: record}, said)
         assert [c.names for c in found] == ([("a.jpg",)] if is_named else [])
     assert not focal_contradictions([camera()], {1: NOTHING}, said)
+
+
+def with_usual(focal: float, sigma: float) -> LineCamera:
+    """Return a camera by lines that alone say a focal length, together with what is usual."""
+    precision = sigma**-2 + lines.USUAL_FOCAL_SIGMA**-2
+    weighted = math.log(focal) * sigma**-2
+    weighted += math.log(lines.USUAL_FOCAL) * lines.USUAL_FOCAL_SIGMA**-2
+    return by_lines(math.exp(weighted / precision), precision**-0.5)
+
+
+def test_what_lines_measure_is_without_what_is_usual_beforehand() -> None:
+    measured = measurement_of_lines(with_usual(2.0, 0.2))
+    assert measured is not None
+    assert measured.focal.focal == pytest.approx(2.0)
+    assert measured.focal.sigma == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("difference", "is_contradicted"), [(0.28, False), (0.4, True)]
+)
+def test_lines_contradict_exif_beyond_what_both_may_be_wrong(
+    difference: float, *, is_contradicted: bool
+) -> None:
+    """Lines are certain to a tenth, EXIF to 8 hundredths; two and a half deviations are 0.32."""
+    record = replace(NOTHING, source="exif")
+    told = {"a.jpg": with_usual(1.2 * math.exp(difference), 0.1)}
+    found = focal_contradictions([camera()], {1: record}, told)
+    assert bool(found) == is_contradicted

@@ -19,6 +19,7 @@ from colmap_affrect.colmap.model_files import (
     relative_pose,
 )
 from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.mappers import few_matches
 from colmap_affrect.mappers.few_matches import MAX_RAW, _Closures, sure_few_matches
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
@@ -150,6 +151,26 @@ def test_of_two_third_images_the_better_one_counts_as_if_chance_had_tried_both()
     assert by_one == pytest.approx(10.0)
     by_two = _Closures(two).log10_evidence((1, 2), rows)
     assert by_two == pytest.approx(10.0 - np.log10(2.0))
+
+
+def test_chance_matches_any_feature_that_the_second_image_has_in_common_with_the_third() -> (
+    None
+):
+    """The third image has 10 features with the first one, and 40 with the second one."""
+    ten = np.stack([np.arange(10), np.arange(10)], axis=1)
+    forty = np.stack([np.arange(40), np.arange(40)], axis=1)
+    closures = _Closures({(1, 2): ten, (1, 3): ten, (2, 3): forty})
+    expected = 10.0 * math.log10(40.0)
+    assert closures.log10_evidence((1, 2), ten) == pytest.approx(expected)
+
+
+def test_few_matches_that_chance_explains_are_sure_where_third_images_confirm_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    targets(path, 8)
+    monkeypatch.setattr(few_matches, "significance", lambda *_, **__: -20.0)
+    assert len(sure_ids(path)) == 10
 
 
 def test_many_raw_matches_are_not_looked_at(tmp_path: Path) -> None:

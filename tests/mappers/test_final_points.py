@@ -6,12 +6,14 @@ import copy
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mapping_tasks import SEED, mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers import final_points
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.final_points import complete_points
 from colmap_affrect.mappers.mapping import map_database
@@ -128,6 +130,35 @@ def test_pair_that_contradicts_the_model_makes_no_points(
                 database.write_two_view_geometry(*ids, geometry)
     complete(model, path, all_weak=all_weak)
     assert model.num_points3D() == 0
+
+
+def test_pairs_that_are_not_among_the_strongest_make_points_too(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    model = placed(path)
+    complete(model, path, all_weak=True)
+    assert model.num_points3D() >= 195
+
+
+def test_points_that_fail_are_refined_again_alone_and_without_robust_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    model = placed(path)
+    complete(model, path)
+    ids = model.point3D_ids()
+    failing = set(sorted(ids)[:3])
+    refined = list[tuple[pycolmap.LossFunctionType, set[int]]]()
+
+    def refine(**given: Any) -> None:
+        refined.append((given["loss"], ids - given["constant"]))
+
+    monkeypatch.setattr(final_points, "_refine", refine)
+    monkeypatch.setattr(final_points, "_failing", lambda *_: set(failing))
+    complete(model, path)
+    assert refined == [
+        (pycolmap.LossFunctionType.CAUCHY, ids),
+        (pycolmap.LossFunctionType.TRIVIAL, failing),
+    ]
 
 
 def test_points_marked_by_hand_stay_where_they_are(tmp_path: Path) -> None:

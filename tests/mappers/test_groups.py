@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from mapping_tasks import mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers.groups import with_other_groups
 from colmap_affrect.mappers.mapping import map_database
 
 FIRST = {1, 2, 3, 4, 5}
@@ -43,3 +46,22 @@ def test_a_weaker_group_of_three_is_a_model_too(tmp_path: Path) -> None:
     synthesize(path, num_rigs=8, num_points3D=100)
     keep_groups(path, FIRST, SECOND)
     assert sizes_of_models(path) == [5, 3]
+
+
+def test_a_group_is_mapped_by_pairs_inside_of_it_alone() -> None:
+    """Images 1 to 3 have a model; a pair that is not among the strongest ties 3 and 4."""
+    inside = [SimpleNamespace(ids=ids) for ids in ((4, 5), (4, 6), (5, 6))]
+    others = [SimpleNamespace(ids=ids) for ids in ((1, 2), (2, 3))]
+    across = SimpleNamespace(ids=(3, 4))
+    left_out = list[list[tuple[int, int]]]()
+    graph = SimpleNamespace(
+        pairs=[*inside, *others],
+        verified=[*inside, *others, across],
+        without=left_out.append,
+    )
+    search: Any = SimpleNamespace(graph=graph, best=lambda _: [])
+    known: Any = SimpleNamespace(
+        reconstruction=SimpleNamespace(reg_image_ids=lambda: [1, 2, 3])
+    )
+    assert with_other_groups(search, [known]) == [known]
+    assert left_out == [[(1, 2), (2, 3), (3, 4)]]

@@ -67,6 +67,18 @@ def test_mapper_options_win_over_the_preset(preset: str) -> None:
     assert mapper.options.preset_name == preset
 
 
+@pytest.mark.parametrize(
+    ("name", "num_of_first"), [("sparse", 40), ("incremental", 50)]
+)
+def test_small_sets_need_fewer_inliers_than_colmap_asks_for_and_long_lenses(
+    name: str, num_of_first: int
+) -> None:
+    mapper = mapper_of(name).native(NOTHING_KNOWN, SEED).get_mapper()
+    assert mapper.init_min_num_inliers == num_of_first
+    assert mapper.abs_pose_min_num_inliers == 12
+    assert mapper.max_focal_length_ratio == 30.0
+
+
 def test_values_that_colmap_does_not_accept_are_named() -> None:
     given = {"init_min_num_inliers": -4, "min_num_matches": 16}
     with pytest.raises(

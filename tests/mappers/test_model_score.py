@@ -88,3 +88,15 @@ def test_long_tracks_are_points_that_images_from_three_viewpoints_see() -> None:
     assert _seen_by_three(seen, {1: 1, 3: 1}).tolist() == []
     twice_in_one = {1: np.array([5, 5]), 2: np.array([5])}
     assert _seen_by_three(twice_in_one, {}).tolist() == []
+
+
+def test_improbable_cameras_lower_the_score(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize(path, num_rigs=3, num_points3D=60)
+    graph = PairGraph.read(path)
+    scores = []
+    for cost in (0.0, 5.0):
+        prior: Any = SimpleNamespace(cost_of=lambda _, cost=cost: cost)
+        priors = dict.fromkeys(model.cameras, prior)
+        scores.append(ModelScorer(graph, priors).score(model))
+    assert scores[1] == pytest.approx(scores[0] - 15.0)  # of three cameras

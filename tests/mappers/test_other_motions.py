@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +23,15 @@ from wall_scene import (
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import Side
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.mappers.other_motions import share_of_motion
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.other_motions import (
+    _Motions,
+    _motions_of_pair,
+    share_of_motion,
+)
+from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary
 
 NUM_POINTS = 1200
@@ -149,3 +157,64 @@ def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE
+
+
+CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 900.0, 800, 600)
+NOTHING = pycolmap.TwoViewGeometry()
+NO_MATCHES = np.zeros((0, 2), np.int64)
+
+
+@pytest.mark.parametrize(("error_px", "num_far"), [(5.0, 0), (8.0, 60), (50.0, 60)])
+def test_matches_contradict_a_model_that_are_half_as_far_again_as_those_that_agree(
+    error_px: float, num_far: int
+) -> None:
+    """Those that agree are up to 4 px off. The second image is from the left of the first one."""
+    random = np.random.default_rng(3)
+    points = random.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 9.0), (120, 3))
+    first = CAMERA.img_from_cam(points)
+    second = CAMERA.img_from_cam(points + np.array([0.5, 0.0, 0.0]))
+    second[:60, 1] += np.sqrt(2.0) * error_px  # Sampson's error is of both images
+    rows = np.stack([np.arange(120)] * 2, axis=1)
+    graph: Any = SimpleNamespace(
+        keypoints={1: first.astype(np.float32), 2: second.astype(np.float32)},
+        shaped_keypoints={},
+        raw_matches={},
+    )
+    poses = {1: (np.eye(3), np.zeros(3)), 2: (np.eye(3), np.array([0.5, 0.0, 0.0]))}
+    found = _motions_of_pair(
+        VerifiedPair((1, 2), rows, NOTHING), poses, {1: CAMERA, 2: CAMERA}, graph
+    )
+    assert (len(found.other) if found else 0) == num_far
+    if found:
+        assert found.own[:, 0].tolist() == list(range(60, 120))
+
+
+def test_a_cell_belongs_to_the_motion_with_more_matches_in_it() -> None:
+    places = np.array([[50.0, 50.0]] * 5 + [[250.0, 50.0]] * 3 + [[50.0, 250.0]])
+    side = Side(CAMERA, places.astype(np.float32))
+    own = np.array([0, 1, 2, 5])  # three in the first cell and one in the second
+    other = np.array([3, 4, 6, 7, 8])  # two, two, and one in the third
+    motions = _Motions(
+        VerifiedPair((1, 2), NO_MATCHES, NOTHING),
+        (side, side),
+        np.stack([own, own], axis=1),
+        np.stack([other, other], axis=1),
+    )
+    assert motions.cells().tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("feature", "is_chained"),
+    [((1, 10), True), ((2, 20), True), ((1, 20), False), ((2, 10), False)],
+)
+def test_motion_is_chained_by_a_third_of_its_features_in_either_image(
+    feature: tuple[int, int], *, is_chained: bool
+) -> None:
+    motions = _Motions(
+        VerifiedPair((1, 2), NO_MATCHES, NOTHING),
+        (Side(CAMERA, np.zeros((0, 2), np.float32)),) * 2,
+        NO_MATCHES,
+        np.array([[10, 20], [11, 21], [12, 22]]),
+    )
+    assert motions.is_chained(Counter({feature: 2})) == is_chained
+    assert not motions.is_chained(Counter({feature: 1}))

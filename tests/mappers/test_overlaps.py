@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from colmap_affrect.mappers.surroundings import (
     CONTRADICTED,
     Overlap,
     _counted,
+    _cut_at_collages,
     _joint_log_ratio,
     _Views,
 )
@@ -154,3 +156,86 @@ def test_pairs_tell_together_as_if_each_told_half_again() -> None:
     assert _joint_log_ratio([one] * 4) == pytest.approx(2.0 * one.log_ratio)
     assert _joint_log_ratio([one, Overlap(2.0, 0.0)]) == pytest.approx(one.log_ratio)
     assert _joint_log_ratio([]) == 0.0
+
+
+def test_what_is_hidden_is_told_by_depths_along_the_camera_that_looks() -> None:
+    """The camera is turned and has moved, so that its axes are none of those of the world."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", FOCAL_PX, WIDTH, HEIGHT
+    )
+    model.add_camera_with_trivial_rig(camera)
+    local = Surface((400.0, 600.0), (200.0, 400.0), FAR, (LEFT,)).points()
+    pixels = FOCAL_PX * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+    pose = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([0.7, -0.4, 0.2])), np.array([3.0, -2.0, 1.0])
+    )
+    image = pycolmap.Image("1.jpg", pixels, 1, LEFT)
+    model.add_image_with_trivial_frame(image, pose)
+    for index, point in enumerate(local):
+        track = pycolmap.Track()
+        track.add_element(LEFT, index)
+        model.add_point3D(pose.inverse() * point, track)
+    middle = np.array([[500.0, 300.0]] * 3)
+    depths = np.array([0.5 * FAR, 1.1 * FAR, 1.2 * FAR])
+    is_hidden = _Views(model)._is_hidden(LEFT, middle, depths)
+    assert is_hidden.tolist() == [False, False, True]
+
+
+class _AlwaysOtherRegions:
+    """Images that share points with others in other regions of them."""
+
+    def regions_differ(self, *_: object) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("pairs", "parts", "collages"),
+    [
+        # the fourth image alone hangs on the third one
+        ([(1, 2), (1, 3), (2, 3), (3, 4)], [{1, 2, 3, 4}], set()),
+        # the fourth and the fifth do
+        ([(1, 2), (1, 3), (2, 3), (3, 4), (3, 5), (4, 5)], [{1, 2, 3}, {4, 5}], {3}),
+    ],
+)
+def test_a_collage_ties_two_images_or_more_to_others(
+    pairs: list[tuple[int, int]], parts: list[set[int]], collages: set[int]
+) -> None:
+    views: Any = _AlwaysOtherRegions()
+    overlaps = dict.fromkeys(pairs, Overlap(20.0, 19.0))
+    place = {image_id for pair in pairs for image_id in pair}
+    found = set[int]()
+    assert _cut_at_collages(place, overlaps, views, found) == parts
+    assert found == collages
+
+
+@pytest.mark.parametrize(("num_common", "differ"), [(0, True), (1, True), (4, False)])
+def test_regions_of_an_image_differ_that_have_a_tenth_of_their_cells_in_common(
+    num_common: int, *, differ: bool
+) -> None:
+    """An image shares 20 cells with a second one, and 30 cells with a third one."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", FOCAL_PX, WIDTH, HEIGHT
+    )
+    model.add_camera_with_trivial_rig(camera)
+    columns = (np.arange(64) % 8 + 0.5) * WIDTH / 8
+    rows = (np.arange(64) // 8 + 0.5) * HEIGHT / 8
+    one_in_each_cell = np.stack([columns, rows], axis=1)
+    for image_id in (1, 2, 3):
+        image = pycolmap.Image(f"{image_id}.jpg", one_in_each_cell, 1, image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    seen_by_second = range(20)
+    seen_by_third = range(20 - num_common, 50 - num_common)
+    for cell in range(64):
+        track = pycolmap.Track()
+        track.add_element(1, cell)
+        if cell in seen_by_second:
+            track.add_element(2, cell)
+        if cell in seen_by_third:
+            track.add_element(3, cell)
+        model.add_point3D(np.ones(3), track)
+    views = _Views(model)
+    assert views.regions_differ(1, {2}, {3}) == differ
+    assert views.regions_differ(1, {3}, {2}) == differ
+    assert not views.regions_differ(1, {2}, set())

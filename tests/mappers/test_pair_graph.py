@@ -25,7 +25,7 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
-from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS
+from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS, _ranks
 
 NUM_IMAGES = 5
 
@@ -56,6 +56,12 @@ def test_a_thinned_graph_has_enough_matches_of_each_pair_and_image(path: Path) -
         assert rows_in(pair.matches, whole.matches).all()
     assert min(map(len, features_of_pairs(thin).values())) >= NUM_TRACKS
     assert thin.thinned() is thin
+
+
+def test_tracks_of_most_images_come_first_and_ambiguous_ones_last() -> None:
+    num_features = np.array([2, 5, 3, 4, 2])
+    num_images = np.array([2, 4, 3, 4, 1])  # the second and the last one are ambiguous
+    assert _ranks(num_features, num_images).tolist() == [2, 3, 1, 0, 4]
 
 
 def test_a_thinned_graph_has_its_tracks_whole(path: Path) -> None:

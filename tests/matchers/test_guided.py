@@ -182,6 +182,33 @@ def test_accidental_matches_are_counted_near_the_geometry() -> None:
     assert_array_equal(guided_matches(descriptors, None, model, NONE, OPTIONS), NONE)
 
 
+@pytest.mark.parametrize(
+    ("num_across", "num_down", "is_proven"),
+    [
+        (300, 0, True),  # what lies behind the plane is displaced along one axis only
+        (0, 300, True),
+        (40, 40, True),  # a fifth of what is found near the homography
+        (300, 300, False),
+    ],
+)
+def test_accidental_matches_along_both_axes_are_half_of_those_that_prove_nothing(
+    num_across: int, num_down: int, *, is_proven: bool
+) -> None:
+    """Beside 200 features of a plane others match that are 18 px beside it, or below it."""
+    random = np.random.default_rng(8)
+    num = 200 + num_across + num_down
+    points1 = random.uniform(0, (640, 480), (num, 2))
+    points2 = points1.copy()
+    points2[200 : 200 + num_across] -= (18.0, 0.0)
+    points2[200 + num_across :] -= (0.0, 18.0)
+    descriptors = random.normal(size=(num, 64))
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    both = descriptors.astype(np.float32), descriptors.astype(np.float32)
+    model = HomographyModel(np.eye(3), (points1, points2))
+    found = guided_matches(both, None, model, NONE, OPTIONS)
+    assert len(found) == (200 if is_proven else 0)
+
+
 def shapes_of_plane(model: HomographyModel) -> Arrays:
     """Shapes of LAFs on the plane, of which the first 60 are rotated in image 2."""
     shapes1 = np.eye(2) + 0.2 * np.random.default_rng(3).normal(size=(200, 2, 2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -160,6 +161,32 @@ def test_match_features_rejects_the_same_descriptor_at_two_far_places() -> None:
     first = (descriptors, spread(60))
     second = (np.concatenate([descriptors, descriptors]), spread(120))
     assert run(first, second, NearestOptions()).indices.tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("ratio", "is_match"), [(0.2, True), (0.8, True), (0.9, False)]
+)
+def test_the_nearest_descriptor_is_a_match_that_is_a_seventh_nearer_than_others(
+    ratio: float, *, is_match: bool
+) -> None:
+    """The distances of two others are as 0.3 times the ratio to 0.3."""
+    angles = np.array([0.3 * ratio, -0.3])
+    others = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    query = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
+    first = (query, spread(2))
+    second = (others.astype(np.float32), spread(2))
+    found = run(first, second, NearestOptions()).indices.tolist()
+    assert ([0, 0] in found) == is_match
+
+
+@pytest.mark.parametrize(("distance_px", "num"), [(1.5, 1), (2.5, 2), (15.0, 2)])
+def test_matches_that_are_less_than_two_px_apart_in_both_images_are_one(
+    distance_px: float, num: int
+) -> None:
+    descriptors = np.eye(3, dtype=np.float32)
+    points = np.array([[0.0, 0.0], [distance_px, 0.0], [500.0, 0.0]])
+    image = (descriptors, points)
+    assert len(run(image, image, NearestOptions()).indices) == num + 1
 
 
 NUM_SHAPED = 400  # features of an image with shapes of their own

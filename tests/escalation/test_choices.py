@@ -1,0 +1,316 @@
+"""Which models and matches are chosen, decided by what is on record alone; nothing is mapped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from colmap_affrect.escalation import alternatives, escalate
+from colmap_affrect.escalation.alternatives import (
+    SCORE,
+    Choice,
+    _choice_of_learned_matches,
+    _set_of,
+    keep_best,
+    map_learned_matches,
+    needs_learned_models,
+    num_right_poses_of_best,
+    restore_best,
+)
+from colmap_affrect.escalation.escalate import Escalation, Trial
+from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
+from colmap_affrect.project.match_store import Learned, PairMatches
+from colmap_affrect.recipes import EscalateOptions
+
+NAMES = ["a", "b", "c"]
+
+
+def context_in(folder: Path, **state: Any) -> Any:
+    """Return a context with an empty model and matches, and the digest of its pairs."""
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (folder / "matches.h5").write_bytes(b"these")
+    workspace = SimpleNamespace(
+        best=folder / "best",
+        learned=folder / "learned",
+        sparse=folder / "sparse",
+        matches=folder / "matches.h5",
+        model_inputs=lambda: "these",
+    )
+    return SimpleNamespace(
+        workspace=workspace,
+        current_model_inputs=lambda: "these",
+        features=SimpleNamespace(names=lambda: NAMES),
+        by_hand=SimpleNamespace(
+            digest=lambda: "", allows=lambda *pair: pair != ("a", "c")
+        ),
+        matches=SimpleNamespace(state=MatchState(listed="pairs", **state)),
+    )
+
+
+def let_models_have(poses: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let so many poses of the models that are there be right."""
+    monkeypatch.setattr(alternatives, "num_right_poses_now", lambda _: poses)
+
+
+@pytest.mark.parametrize(
+    ("now", "is_needed"), [(2.9, True), (3.0, False), (3.1, False)]
+)
+def test_learned_models_are_needed_where_more_of_their_poses_are_right(
+    now: float, *, is_needed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path)
+    of_set = _set_of(context)
+    learned = LearnedModels(of_set, score=3.0, is_sure=False, score_without=1.0)
+    context.matches.state = MatchState(listed="pairs", learned_models=learned)
+    let_models_have(now, monkeypatch)
+    assert needs_learned_models(context) == is_needed
+    context.workspace.learned.mkdir()
+    assert not needs_learned_models(context)
+
+
+@pytest.mark.parametrize(
+    ("sure", "is_sure"), [(["a", "b", "c"], True), (["a", "b"], False), ([], False)]
+)
+def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
+    sure: list[str], *, is_sure: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path)
+    context.by_hand.left_out = ()
+    recorded = list[LearnedModels]()
+
+    def update_state(learned_models: LearnedModels) -> None:
+        recorded.append(learned_models)
+
+    context.matches.update_state = update_state
+    model = SimpleNamespace(sure=sure, probabilities=dict.fromkeys(NAMES, 0.9))
+    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [model])
+    monkeypatch.setattr(
+        alternatives, "_choice_of_learned_matches", lambda _: Choice((), {})
+    )
+    let_models_have(1.2, monkeypatch)
+    escalation: Any = SimpleNamespace(context=context)
+    mapper: Any = None
+    map_learned_matches(escalation, mapper)
+    (found,) = recorded
+    assert found.is_sure == is_sure
+    assert found.score == pytest.approx(3 * 0.9 - 1.0)
+    assert found.score_without == 1.2
+
+
+def test_the_best_models_are_kept_with_their_matches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path)
+    best = context.workspace.best
+    kept = []
+    for poses, matches in (
+        (2.0, b"first"),
+        (1.0, b"worse"),
+        (2.0, b"as good"),
+        (3.0, b"better"),
+    ):
+        context.workspace.matches.write_bytes(matches)
+        let_models_have(poses, monkeypatch)
+        keep_best(context)
+        kept.append((best / "matches.h5").read_bytes())
+    assert kept == [b"first", b"first", b"as good", b"better"]
+    assert (best / "0").is_dir()
+    assert num_right_poses_of_best(context) == 3.0
+
+
+def test_best_models_of_other_pairs_are_worth_nothing(tmp_path: Path) -> None:
+    context = context_in(tmp_path)
+    context.workspace.best.mkdir()
+    score = context.workspace.best / SCORE
+    score.write_text(json.dumps([_set_of(context), 2.5]), encoding="utf-8")
+    assert num_right_poses_of_best(context) == 2.5
+    score.write_text(json.dumps(["others", 2.5]), encoding="utf-8")
+    assert num_right_poses_of_best(context) == 0.0
+
+
+def test_models_that_are_as_good_as_the_best_ones_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation: Any = SimpleNamespace(context=context_in(tmp_path))
+    monkeypatch.setattr(alternatives, "num_right_poses_of_best", lambda _: 2.0)
+    let_models_have(2.0, monkeypatch)
+    assert not restore_best(escalation)
+
+
+def matches_of(first: str, second: str, level: int) -> PairMatches:
+    indices = np.array([[0, 1]])
+    return PairMatches((first, second), indices, np.ones(1, np.float32), 9, level)
+
+
+def test_learned_matches_are_chosen_of_pairs_that_use_others_with_the_worth_of_measured_ones() -> (
+    None
+):
+    """Levels 0 and 1 are measured, the others are learned."""
+    states = {
+        ("a", "b"): PairState(20, 4, level=1),
+        ("a", "c"): PairState(30, 5, level=2),  # uses its learned matches already
+        ("b", "c"): PairState(40, 6, level=3),
+    }
+    learned = {}
+    for first, second in states:
+        learned[first, second] = Learned(matches_of(first, second, 2), (50, 0))
+    escalation: Any = SimpleNamespace(
+        state=SimpleNamespace(
+            states=lambda: states, is_measured=[True, True, False, False]
+        ),
+        matches=SimpleNamespace(learned=lambda _: learned),
+    )
+    choice = _choice_of_learned_matches(escalation)
+    assert [one.names for one in choice.matches] == [("a", "b"), ("b", "c")]
+    assert choice.measured_worths == {("a", "b"): (20, 4)}
+
+
+def escalation_of(context: Any) -> Escalation:
+    """Return an escalation of three pairs."""
+    context.listed_pairs = lambda: [("a", "b"), ("a", "c"), ("b", "c")]
+    levels = [
+        SimpleNamespace(features=SimpleNamespace(has_shapes=one))
+        for one in (True, False)
+    ]
+    context.extraction = SimpleNamespace(levels=levels)
+    return Escalation(context, EscalateOptions())
+
+
+def trial(worth: tuple[int, int], before: PairState, level: int = 1) -> Trial:
+    return Trial(matches_of("a", "b", level), worth, before)
+
+
+def test_matches_that_are_as_good_as_those_before_do_not_take_their_place() -> None:
+    before = PairState(num_inliers=20, num_consistent=5)
+    assert not trial((20, 5), before).is_better
+    assert trial((20, 6), before).is_better
+    assert trial((21, 0), before).is_better
+
+
+def test_what_is_left_of_a_step_is_untried_and_not_rejected_by_hand(
+    tmp_path: Path,
+) -> None:
+    """Pairs that are in no store were tried at no level, or are gone."""
+    escalation = escalation_of(context_in(tmp_path))
+    pairs = (("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"))
+    tried = {("a", "b"): 0b01, ("a", "c"): 0b01, ("b", "c"): 0b11}
+    matches: Any = escalation.matches
+    matches.levels = lambda *_: tried
+    assert escalation._left_of(Begun(1, pairs)) == [("a", "b")]
+
+
+@pytest.mark.parametrize(
+    ("level_before", "level", "worth", "expected"),
+    [
+        (0, 1, (30, 0), {("a", "b"): (20, 5)}),  # learned matches are better
+        (0, 1, (10, 0), {}),  # they are not
+        (0, 0, (30, 0), {}),
+        (1, 0, (30, 0), {("a", "b"): (30, 0)}),  # measured ones are better than before
+        (1, 0, (10, 0), {("a", "b"): (15, 2)}),  # they are not
+        (1, 1, (30, 0), {}),
+    ],
+)
+def test_the_worth_of_the_best_measured_matches_is_kept_in_mind(
+    level_before: int,
+    level: int,
+    worth: tuple[int, int],
+    expected: dict[tuple[str, str], tuple[int, int]],
+    tmp_path: Path,
+) -> None:
+    """Frames of the first level are measured, those of the second one learned."""
+    escalation = escalation_of(context_in(tmp_path))
+    before = PairState(20, 5, level=level_before, measured_worth=(15, 2))
+    found = escalation._measured_worths([trial(worth, before, level)])
+    assert found == expected
+
+
+@pytest.mark.parametrize(("num_inliers", "worth"), [(7, (7, 0)), (0, (0, 6))])
+def test_a_pair_is_worth_its_inliers_or_else_its_consistent_matches(
+    num_inliers: int,
+    worth: tuple[int, int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context = context_in(tmp_path)
+    context.features.read_frames = lambda name: name
+    monkeypatch.setattr(escalate, "num_confirming", lambda *_: 6)
+    verifier: Any = SimpleNamespace(inliers=lambda *_: [(0, 1)] * num_inliers)
+    escalation = escalation_of(context)
+    assert escalation._worth(matches_of("a", "b", 1), verifier) == worth
+
+
+def test_learned_matches_are_used_of_the_level_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = escalation_of(context_in(tmp_path))
+    learned = {
+        ("a", "b"): Learned(matches_of("a", "b", 2), (50, 0)),
+        ("b", "c"): Learned(matches_of("b", "c", 4), (60, 0)),
+    }
+    stores: Any = escalation.matches
+    stores.learned = lambda _: learned
+    before = PairState(20, 5)
+    monkeypatch.setattr(
+        escalation.state, "states", lambda: dict.fromkeys(learned, before)
+    )
+    kept = list[tuple[Any, int]]()
+    monkeypatch.setattr(
+        escalation, "_keep", lambda trials, level: kept.append((trials, level))
+    )
+    assert escalation._use_learned_matches([*learned], 2) == {("a", "b")}
+    expected = Trial(learned["a", "b"].matches, (50, 0), before)
+    assert kept == [([expected], 2)]
+    assert escalation._use_learned_matches([*learned], 3) == set()
+
+
+def test_pairs_that_have_learned_matches_are_not_matched_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = (("a", "b"), ("b", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    context.deadline_s = float("inf")
+    escalation = escalation_of(context)
+    stores: Any = escalation.matches
+    stores.learned_levels = lambda _: {("a", "b"): 2, ("b", "c"): -1}
+    matched = list[tuple[Any, int]]()
+    monkeypatch.setattr(
+        escalation,
+        "_match_with",
+        lambda batch, level, _: matched.append((batch, level)),
+    )
+    monkeypatch.setattr(escalation, "write", lambda: None)
+    assert escalation.match_learned() == 1
+    assert matched == [([("b", "c")], 2)]
+
+
+def test_images_get_the_features_that_they_lack_of_a_level_and_of_its_base(
+    tmp_path: Path,
+) -> None:
+    """The third level is matched together with the second one."""
+    context = context_in(tmp_path)
+    escalation = escalation_of(context)
+    context.extraction.levels = [SimpleNamespace(base=base) for base in (0, 1, 1)]
+    there = {"a": {0, 1}, "b": {0}, "c": {0, 1, 2}}
+    context.features.level_ranges = there.get
+    found = escalation._missing_features([("b", "a"), ("a", "c")], 2)
+    assert found == [("a", 2), ("b", 1), ("b", 2)]
+
+
+@pytest.mark.parametrize(
+    ("levels", "has_all"), [([2, 2], True), ([2, -1], False), ([-1, -1], False)]
+)
+def test_learned_matching_is_complete_when_no_pair_lacks_learned_matches(
+    levels: list[int], *, has_all: bool, tmp_path: Path
+) -> None:
+    pairs = (("a", "b"), ("b", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    escalation = escalation_of(context)
+    matches: Any = escalation.matches
+    matches.learned_levels = lambda _: dict(zip(pairs, levels, strict=True))
+    assert escalation.has_all_learned_matches == has_all
