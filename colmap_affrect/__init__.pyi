@@ -67,7 +67,7 @@ from colmap_affrect.project.reasons import Doubt as Doubt
 from colmap_affrect.project.reasons import Missing as Missing
 from colmap_affrect.project.report import ModelSummary as ModelSummary
 from colmap_affrect.project.report import ReconstructionReport as ReconstructionReport
-from colmap_affrect.project.report import StageReport as StageReport
+from colmap_affrect.project.stage_report import StageReport as StageReport
 from colmap_affrect.recipes import ExtractionOptions as ExtractionOptions
 from colmap_affrect.recipes import Recipe as Recipe
 from colmap_affrect.recipes import load_recipe as load_recipe

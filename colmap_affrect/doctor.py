@@ -7,7 +7,7 @@ Files are read as runs read them, and what their readers say is what is found.
 import dataclasses
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -316,13 +316,7 @@ class _OutputFolder:
         self.read(workspace.cameras, lambda: read_camera_records(workspace.cameras))
         if done:
             self._examine_stores(context)
-        if "extract" in done:
-            self._require(workspace.features)
-            if "match" in done:
-                self._require(workspace.matches)
-            self._examine_pairs(context, are_listed="match" in done)
-        if not {"copy", "verify"}.isdisjoint(done):  # else the next stage makes it
-            self._require(workspace.database)
+        self._require_files(context, done)
         if not workspace.database.exists():
             return
         advice = ""
@@ -333,6 +327,16 @@ class _OutputFolder:
             self._examine_counts(context)
         if is_usable and "map" in done:
             self._examine_models()
+
+    def _require_files(self, context: Context, done: Collection[str]) -> None:
+        """Find what is missing of the files that stages which are done have left."""
+        if "extract" in done:
+            self._require(self.workspace.features)
+            if "match" in done:
+                self._require(self.workspace.matches)
+            self._examine_pairs(context, are_listed="match" in done)
+        if not {"copy", "verify"}.isdisjoint(done):  # else the next stage makes it
+            self._require(self.workspace.database)
 
     def _examine_counts(self, context: Context) -> None:
         """Find images of which the database has more features than their file, as of another run.

@@ -129,15 +129,9 @@ class Forecast:
     def least_and_most_s(self) -> tuple[float, float] | None:
         """Return the seconds that are left if nothing follows the first model, and if all does."""
         now_s = self._clock()
-        here_s = self._stage.left_s(now_s)
-        if here_s is None and self._stage.cost:
-            here_s = self._left_by_cost_s(now_s)
-        if here_s is None and self._stage.cost:
-            here_s = self._expected_left_s(now_s)
+        here_s = self._left_of_stage_s(now_s)
         if here_s is None or now_s - self._run_began_s < MIN_ELAPSED_S:
             return None
-        if self._name == "map":
-            here_s = max(here_s, self._left_of_map_s(now_s))
         if not self._is_first_model:
             passed_s = now_s - self._limit_told_s
             left_s = max(here_s, LIKELY_SHARE * self._limit_s - passed_s)
@@ -150,6 +144,17 @@ class Forecast:
         if not after_s:
             after_s = AFTER_SHARE * (now_s - self._work_began_s + least_s)
         return least_s, least_s + after_s
+
+    def _left_of_stage_s(self, now_s: float) -> float | None:
+        """Return the seconds that are left of the stage; None while nobody knows."""
+        here_s = self._stage.left_s(now_s)
+        if here_s is None and self._stage.cost:
+            here_s = self._left_by_cost_s(now_s)
+        if here_s is None and self._stage.cost:
+            here_s = self._expected_left_s(now_s)
+        if here_s is not None and self._name == "map":
+            here_s = max(here_s, self._left_of_map_s(now_s))
+        return here_s
 
     def _expected_left_s(self, now_s: float) -> float | None:
         """Return how long a stage takes of which nothing is done; None where nobody knows."""

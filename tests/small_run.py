@@ -12,12 +12,8 @@ from synthetic import texture, write_image
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
-from colmap_affrect.project.report import (
-    Advice,
-    Bridge,
-    ModelSummary,
-    StageReport,
-)
+from colmap_affrect.project.report import Advice, Bridge, ModelSummary
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pair_lines import lines_of_pairs

@@ -37,7 +37,8 @@ from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.image_failures import UnusableImageError
 from colmap_affrect.project.match_state import Begun, Worth
 from colmap_affrect.project.match_store import Learned, PairMatches
-from colmap_affrect.project.report import MatchedAgain, StageReport
+from colmap_affrect.project.report import MatchedAgain
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context

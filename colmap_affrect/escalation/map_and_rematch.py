@@ -21,7 +21,7 @@ from colmap_affrect.escalation.alternatives import (
 from colmap_affrect.escalation.escalate import Escalation, begin
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide

@@ -46,7 +46,7 @@ from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, GivenProgress, Progress
 from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Inputs, Resources

@@ -234,20 +234,28 @@ class TieJoiner:
             return None
         points2d = np.array([marks[name] for name in names])
         points3d = np.array([positions[name] for name in names])
-        key = image.camera_id
-        is_used = key in {camera.camera_id for camera in cameras_of(model).values()}
-        camera = (model if is_used else self.grower.graph.cache).cameras[key]
-        prior = self.grower.adjuster.priors[key]
-        is_open = not is_used and not prior.has_prior_focal_length
-        trials = [copy.copy(camera)]
-        if is_open:
-            trials = [_with_focal(camera, focal_px) for focal_px in prior.starts_px]
+        trials, is_open = self._trial_cameras(image, model)
         best: _Resection | None = None
         for trial in trials:
             found = self._resection(points2d, points3d, trial, refine_focal=is_open)
             if found and (best is None or found.rank > best.rank):
                 best = found
         return best
+
+    def _trial_cameras(
+        self, image: pycolmap.Image, model: pycolmap.Reconstruction
+    ) -> tuple[list[pycolmap.Camera], bool]:
+        """Return the cameras that an image may have, and whether the focal length is open."""
+        key = image.camera_id
+        used = {camera.camera_id for camera in cameras_of(model).values()}
+        if key in used:
+            return [copy.copy(model.cameras[key])], False
+        camera = self.grower.graph.cache.cameras[key]
+        prior = self.grower.adjuster.priors[key]
+        if prior.has_prior_focal_length:
+            return [copy.copy(camera)], False
+        trials = [_with_focal(camera, focal_px) for focal_px in prior.starts_px]
+        return trials, True
 
     def _resection(
         self,

@@ -33,7 +33,7 @@ from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe

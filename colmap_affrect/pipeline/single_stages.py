@@ -18,7 +18,7 @@ from colmap_affrect.pipeline import context_of, map_and_report, mapper_of
 from colmap_affrect.progress import GivenProgress
 from colmap_affrect.project.argument_types import require_bools
 from colmap_affrect.project.paths import PathLike, as_path
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.session.run_options import RunKeywords, RunOptions

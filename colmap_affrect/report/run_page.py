@@ -243,14 +243,9 @@ def _views(workspace: Workspace, report: RunReport) -> list[View3D]:
 
 def _card(name: str, report: RunReport, photograph: PhotographReport) -> Card:
     """Return what became of a photograph."""
-    kind = photograph.quality
     if photograph.model is None:
-        why = report.unregistered.get(name)
-        text = why.text() if why else FATES["not_registered"]
-        for stage in report.stages:
-            if name in stage.failed:
-                text += f": {stage.failed[name].text()}"
-        return Card(name, "missing", text, ("all", "missing"))
+        return _card_of_missing(name, report)
+    kind = photograph.quality
     model = report.models[photograph.model]
     texts = [str(kind)]
     if photograph.probability is not None:
@@ -269,6 +264,16 @@ def _card(name: str, report: RunReport, photograph: PhotographReport) -> Card:
     if name in doubts:
         texts.append(_own_reason(name, doubts))
     return Card(name, kind, "; ".join(filter(None, texts)), tuple(groups))
+
+
+def _card_of_missing(name: str, report: RunReport) -> Card:
+    """Return why a photograph is in no model."""
+    why = report.unregistered.get(name)
+    text = why.text() if why else FATES["not_registered"]
+    for stage in report.stages:
+        if name in stage.failed:
+            text += f": {stage.failed[name].text()}"
+    return Card(name, "missing", text, ("all", "missing"))
 
 
 def _own_reason(name: str, doubts: Mapping[str, tuple[Doubt, ...]]) -> str:

@@ -11,12 +11,8 @@ from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.report import (
-    ModelSummary,
-    StageReport,
-    installed_versions,
-    sum_by_stage,
-)
+from colmap_affrect.project.report import ModelSummary, installed_versions
+from colmap_affrect.project.stage_report import StageReport, sum_by_stage
 from colmap_affrect.report.advice import (
     advice,
     command_with_masks,

@@ -48,19 +48,14 @@ def groups_of(
     Returns:
         Reasons, those of most photographs first.
     """
-    doubts = dict[str, Sequence[Doubt]]()
-    for model in models:
-        doubts |= {**model.unsure, **model.doubtful}
+    doubts = _doubts_by_name(models, unregistered)
     fates = dict[str, list[int]]()
     by_kind = dict[tuple[Value, ...], list[tuple[int, Doubt]]]()
     for number, name in enumerate(names):
         missing = unregistered.get(name)
-        of_photograph = doubts.get(name, ())
-        if missing and not of_photograph:
-            of_photograph = missing.doubts
-        if missing and not of_photograph and not missing.model:
+        if name not in doubts and missing and not missing.model:
             fates.setdefault(missing.fate(), []).append(number)
-        for doubt in of_photograph:
+        for doubt in doubts.get(name, ()):
             by_kind.setdefault(_kind(doubt), []).append((number, doubt))
     found = []
     for members in by_kind.values():
@@ -69,6 +64,19 @@ def groups_of(
     for fate, numbers in fates.items():
         found.append(Group(fate, tuple(numbers)))
     found.sort(key=lambda group: -len(group.photographs))
+    return found
+
+
+def _doubts_by_name(
+    models: Sequence[ModelSummary], unregistered: Mapping[str, Missing]
+) -> dict[str, Sequence[Doubt]]:
+    """Return why photographs are doubted; those of models that are kept come first."""
+    found = dict[str, Sequence[Doubt]]()
+    for name, missing in unregistered.items():
+        if missing.doubts:
+            found[name] = missing.doubts
+    for model in models:
+        found |= {**model.unsure, **model.doubtful}
     return found
 
 

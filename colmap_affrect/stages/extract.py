@@ -30,7 +30,7 @@ from colmap_affrect.project.feature_store import NOT_KNOWN, FeatureStore
 from colmap_affrect.project.image_failures import ImageFailure, UnusableImageError
 from colmap_affrect.project.paths import PathLike
 from colmap_affrect.project.record import WEIGHTS, Content
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning, WarningCode
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe

@@ -30,7 +30,7 @@ from colmap_affrect.pairs.given_matches import MatchType, given_matches
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.paths import as_path_or_none, resolved
 from colmap_affrect.project.record import content_of
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.session.context import Context, source_files
 from colmap_affrect.stages.descriptors import (

@@ -28,7 +28,7 @@ from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.match_store import PAIRS_PER_WRITE
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px

@@ -21,7 +21,8 @@ from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.record import OWN, ModelInputs
-from colmap_affrect.project.report import NO_MODEL, ModelSummary, StageReport
+from colmap_affrect.project.report import NO_MODEL, ModelSummary
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.verify import extracted_px

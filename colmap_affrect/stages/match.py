@@ -41,7 +41,7 @@ from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_store import PAIRS_PER_WRITE, MatchStore, PairMatches
 from colmap_affrect.project.record import WEIGHTS, file_sha256
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.session.context import Context, Resources, require_same_files

@@ -13,7 +13,7 @@ from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.record import content_of
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import write_images_and_keypoints

@@ -11,7 +11,7 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.database_export import (
     write_images_and_keypoints,

@@ -36,7 +36,8 @@ from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.options import EFFORT_NAMES, EffortName
 from colmap_affrect.pipeline import run
-from colmap_affrect.project.report import ModelSummary, StageReport
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.run_options import RunOptions

@@ -25,7 +25,8 @@ from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_store import MatchStore
-from colmap_affrect.project.report import ModelSummary, StageReport
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context, Resources

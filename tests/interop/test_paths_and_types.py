@@ -124,7 +124,7 @@ def test_type_checkers_see_the_types(tmp_path: Path) -> None:
     said = done.stdout.splitlines()
     lines = [line for line in said if "Revealed type" in line]
     name, keyword, field = (line for line in said if " error: " in line)
-    report = "colmap_affrect.project.report"
+    report = "colmap_affrect.project.stage_report"
     assert [line.partition("Revealed type is ")[2] for line in lines] == [
         '"colmap_affrect.report.run_report.RunReport"',
         '"pycolmap._core.Reconstruction"',

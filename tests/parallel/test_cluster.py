@@ -37,7 +37,7 @@ from colmap_affrect.parallel.cluster import (
 )
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.session.context import Context, Inputs, Resources

@@ -17,7 +17,7 @@ from colmap_affrect.project.image_failures import (
     failure_of,
     unusable,
 )
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.report.line_pictures import LineReports
 
 

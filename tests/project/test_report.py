@@ -15,8 +15,8 @@ from colmap_affrect.project.report import (
     Bridge,
     ModelSummary,
     ReconstructionReport,
-    StageReport,
 )
+from colmap_affrect.project.stage_report import StageReport
 
 LARGE = ModelSummary(
     ("a.png", "č d.png"),

@@ -6,7 +6,7 @@ from string import Formatter
 from typing import get_args
 
 from colmap_affrect.errors import with_flags
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import (
     SENTENCES,
     StageWarning,

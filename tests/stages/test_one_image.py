@@ -25,7 +25,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.project.feature_store import FeatureStore
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
