@@ -128,9 +128,10 @@ def test_best_models_of_other_pairs_are_worth_nothing(tmp_path: Path) -> None:
     context = context_in(tmp_path)
     context.workspace.best.mkdir()
     score = context.workspace.best / SCORE
-    score.write_text(json.dumps([_set_of(context), 2.5]), encoding="utf-8")
+    of_set = _set_of(context)
+    write_sealed(score, json.dumps({"of_set": of_set, "num_right_poses": 2.5}))
     assert num_right_poses_of_best(context) == 2.5
-    score.write_text(json.dumps(["others", 2.5]), encoding="utf-8")
+    write_sealed(score, json.dumps({"of_set": "others", "num_right_poses": 2.5}))
     assert num_right_poses_of_best(context) == 0.0
 
 

@@ -333,8 +333,8 @@ def test_focal_lengths_are_as_likely_as_all_distortions_make_them(
     turns = np.tile(np.eye(3), (len(FOCALS), 1, 1))
     of_others = np.where(np.arange(len(FOCALS)) == 5, 6.0, 0.0)
 
-    def refined_at_once(*given: Any) -> tuple[Array, Array]:
-        return given[1], np.full(len(given[1]), 3.0)
+    def refined_at_once(rotations: Array, **_: Any) -> tuple[Array, Array]:
+        return rotations, np.full(len(rotations), 3.0)
 
     monkeypatch.setattr(line_cameras, "refined", refined_at_once)
     monkeypatch.setattr(
