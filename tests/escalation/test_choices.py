@@ -26,6 +26,7 @@ from colmap_affrect.escalation.escalate import Escalation, Trial
 from colmap_affrect.escalation.expected_gain import PairState
 from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
 from colmap_affrect.project.match_store import Learned, PairMatches
+from colmap_affrect.project.sealed_json import write_sealed
 from colmap_affrect.recipes import EscalateOptions
 
 NAMES = ["a", "b", "c"]

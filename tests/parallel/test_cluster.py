@@ -203,6 +203,7 @@ def test_cluster_that_is_lost_ends_the_run_in_one_line(
         assert time.monotonic() - start < 60
 
 
+@pytest.mark.long
 def test_short_tasks_are_sent_together_and_an_error_comes_at_its_place(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
