@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import AffrectError, Option, such_as
+from colmap_affrect.errors import AffrectError, Option, such_as, with_flags
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
@@ -141,8 +141,12 @@ def _warn_of_images_without_neighbors(
     if lonely:
         logger.warning(
             "gps: %d of %d photographs were not taken %s, or nobody knows where (%s); %s",
-            len(lonely), len(names), near, such_as(lonely), advice,
-        )  # fmt: skip
+            len(lonely),
+            len(names),
+            near,
+            such_as(lonely),
+            with_flags(advice),
+        )
 
 
 def _similar_pairs(
