@@ -28,10 +28,11 @@ def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
 
     Returns:
         The parts that pairs tie whose surroundings match, as places, where more of their relative
-        poses are expected to be right than of the whole; else the places as they are.
+        poses are expected to be right than of the whole, single images among them, which make no
+        model; else the places as they are.
     """
-    parts = [part for part in places.tied if len(part) >= MIN_PART]
-    if len(places.images) > 1 or len(parts) < MIN_PART:
+    models = [part for part in places.tied if len(part) >= MIN_PART]
+    if len(places.images) > 1 or len(models) < 2:
         return places
     together = dict(score(_copied(mapped)))
     for image_id, probability in places.unclear.items():
@@ -39,11 +40,12 @@ def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
             together[image_id] *= probability
     if max(together.values(), default=0.0) >= DOUBTFUL:
         return places
-    parts.sort(key=lambda part: (-len(part), min(part)))
+    parts = sorted(places.tied, key=lambda part: (-len(part), min(part)))
     cut = replace(places, images=parts, unclear={}, why="surer_apart")
     expected = 0.0
     for part in apart(_copied(mapped), cut):
-        expected += _expected_right(score(part))
+        if part.reconstruction.num_reg_images() >= MIN_PART:
+            expected += _expected_right(score(part))
     return cut if expected > _expected_right(together) else places
 
 

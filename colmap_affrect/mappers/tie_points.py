@@ -53,10 +53,10 @@ class TiePoints:
 
     def observe(self, model: pycolmap.Reconstruction) -> None:
         """Give a model a point for each tie point that two of its images see, with all of them."""
-        surroundings = _Surroundings(model)
+        nearby = _NearbyDepths(model)
         for seen in self._seen(model).values():
             if len(seen) > 1 and not _is_observed(model, seen):
-                position = _position(surroundings, _marks(model, seen))
+                position = _position(nearby, _marks(model, seen))
                 if position is not None:
                     _replace_point(model, seen, position)
 
@@ -100,9 +100,9 @@ class TiePoints:
     def positions(self, model: pycolmap.Reconstruction) -> dict[str, Array]:
         """Return the (3,) positions in a model, by two images or else by depths near a mark."""
         found = {}
-        surroundings = _Surroundings(model)
+        nearby = _NearbyDepths(model)
         for name, seen in self._seen(model).items():
-            position = _position(surroundings, _marks(model, seen)) if seen else None
+            position = _position(nearby, _marks(model, seen)) if seen else None
             if position is not None:
                 found[name] = position
         return found
@@ -209,16 +209,14 @@ def _replace_point(
     model.add_point3D(position, track)
 
 
-def _position(
-    surroundings: "_Surroundings", marks: Mapping[int, Array]
-) -> Array | None:
+def _position(nearby: "_NearbyDepths", marks: Mapping[int, Array]) -> Array | None:
     """Return the position of a point with marks in some images, None where they do not tell it."""
-    position = triangulated(surroundings.model, marks) if len(marks) > 1 else None
+    position = triangulated(nearby.model, marks) if len(marks) > 1 else None
     if position is not None:
         return position
     # Where rays do not meet, the residuals will say so.
     image_id, xy = next(iter(marks.items()))
-    return surroundings.position(image_id, xy)
+    return nearby.position(image_id, xy)
 
 
 def _mark_error_px(
@@ -250,7 +248,7 @@ class _Observed:
     depths: Array  # (N,)
 
 
-class _Surroundings:
+class _NearbyDepths:
     """Tells where the ray of a mark is as deep as the points that its image sees around it.
 
     What an image sees is looked up once, so that many marks take no longer each than few.

@@ -63,7 +63,7 @@ SUBJECT = "matches"  # of the warnings
 
 
 @dataclass(frozen=True)
-class _Places:
+class _StillCells:
     """Cells of photographs of one size."""
 
     still: Mask  # nothing moves there, to the pixel
@@ -111,10 +111,10 @@ class StationaryFilter:
         self._features = features
         self._matches = matches
         self._points = lru_cache(NUM_CACHED_IMAGES)(self._read_points)
-        self._places = dict[Size, Mask]()
+        self._still_masks = dict[Size, Mask]()
         self._of_still_cameras = set(matches.state.still_cameras)
         for size, cells in matches.state.stationary:
-            self._places[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
+            self._still_masks[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
         self._backgrounds = dict[str, Mask]()
         for name, packed in matches.state.backgrounds:
             self._backgrounds[name] = _unpacked(packed)
@@ -147,11 +147,11 @@ class StationaryFilter:
         Returns:
             (M,) bool.
         """
-        size = self._common_size(names) if self._places else None
-        if size is None or size not in self._places:
+        size = self._common_size(names) if self._still_masks else None
+        if size is None or size not in self._still_masks:
             return np.ones(len(indices), bool)
         matched = self._matched_cells(names, indices, size)
-        places = self._places[size]
+        places = self._still_masks[size]
         near = grow_mask(places, 1)
         begins_near = _at(near, matched.first)
         dropped = matched.are_still & begins_near
@@ -189,10 +189,12 @@ class StationaryFilter:
             ):
                 idle = [StageWarning("camera_stands_still", SUBJECT)]
             else:
-                self._places[size] = places.still | self._places.get(size, places.still)
+                self._still_masks[size] = places.still | self._still_masks.get(
+                    size, places.still
+                )
                 if places.is_most_exact:
                     self._of_still_cameras.add(size)
-        if not self._places:
+        if not self._still_masks:
             return idle
         self._learn_backgrounds(pairs)
         self._record()
@@ -215,7 +217,9 @@ class StationaryFilter:
     def _learn_backgrounds(self, pairs: Sequence[Pair]) -> None:
         """Find where each photograph shows what stands still, and nothing that hides it."""
         votes: dict[str, _Votes] = defaultdict(_Votes.none)
-        of_sizes = [pair for pair in pairs if self._common_size(pair) in self._places]
+        of_sizes = [
+            pair for pair in pairs if self._common_size(pair) in self._still_masks
+        ]
         for found in self._matches.read(of_sizes):
             size = self._sizes[found.names[0]]
             matched = self._matched_cells(found.names, found.indices, size)
@@ -224,7 +228,7 @@ class StationaryFilter:
                 votes[name].still[:] += _counts(cells[matched.are_still])
                 votes[name].moving[:] += _counts(cells[~matched.are_still])
         for name, of_image in votes.items():
-            background = of_image.background(self._places[self._sizes[name]])
+            background = of_image.background(self._still_masks[self._sizes[name]])
             if background.any():
                 self._backgrounds[name] = background | self._backgrounds.get(
                     name, background
@@ -233,7 +237,7 @@ class StationaryFilter:
     def _record(self) -> None:
         """Put what is known on record."""
         kept = []
-        for size, mask in self._places.items():
+        for size, mask in self._still_masks.items():
             kept.append((size, tuple(map(tuple, np.argwhere(mask.T).tolist()))))
         packed = []
         for name, background in self._backgrounds.items():
@@ -244,7 +248,7 @@ class StationaryFilter:
             backgrounds=tuple(packed),
         )
 
-    def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_Places"]:
+    def _find(self, pairs: Sequence[Pair]) -> dict[Size, "_StillCells"]:
         """Return the cells in which nothing moves, by size."""
         numbers = dict[str, int]()
         num_images = Counter[Size]()
@@ -276,7 +280,7 @@ class StationaryFilter:
             if likely.any():
                 exact = self._evidence(pairs, size, likely) >= MIN_EVIDENCE
                 limit = MAX_SHARE_OF_PHOTOGRAPH * (counts >= MIN_NUM_PAIRS).sum()
-                places[size] = _Places(
+                places[size] = _StillCells(
                     still=likely & exact,
                     is_most=bool(likely.sum() > limit),
                     is_most_exact=bool((likely & exact).sum() > limit),

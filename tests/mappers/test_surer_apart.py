@@ -56,6 +56,14 @@ def test_a_whole_that_is_unclear_is_doubtful() -> None:
     assert not found.unclear
 
 
+def test_a_single_image_is_a_place_of_its_own_which_is_told_why() -> None:
+    tied = Places([HERE | THERE], tied=[{5}, {1, 2}, {3, 4}])
+    found = surer_apart(synthetic_model(), tied, scores(0.3, 0.95))
+    assert found.images == [{1, 2}, {3, 4}, {5}]
+    alone = Places([HERE | THERE], tied=[{5}, {1, 2, 3, 4}])
+    assert surer_apart(synthetic_model(), alone, scores(0.3, 0.95)) is alone
+
+
 def test_one_part_alone_stays_as_it_is() -> None:
     one = Places([HERE | THERE], tied=[HERE | THERE])
     assert surer_apart(synthetic_model(), one, scores(0.1, 0.9)) is one
