@@ -106,19 +106,10 @@ def _models_before(
 def _task(
     context: Context, extend: Extension | None, before: Sequence[MappedModel]
 ) -> MappingTask:
-    """Return what there is to map; another program's database has no matches and depths of ours."""
+    """Return what is mapped, and make its database; that of others has no matches of ours."""
     workspace = context.workspace
-    by_hand = context.by_hand
     copied = workspace.is_foreign
-    path = workspace.database
-    workspace.mapped_database.unlink(missing_ok=True)
-    tie_points: Mapping[str, Mapping[str, int]] = {}
-    if by_hand != NOTHING:
-        path = workspace.mapped_database
-        tie_points = by_hand.copy_database(workspace.database, path)
-    if by_hand.masks_path:  # pairs that lost matches have no geometry any more
-        sizes_px = None if copied else extracted_px(context)
-        verify(path, context.verification, sizes_px)
+    path, tie_points = _make_mapped_database(context)
     unmeasured = [] if copied else unmeasured_pairs(context)
     return MappingTask(
         database_path=path,
@@ -131,6 +122,27 @@ def _task(
         may_share=not copied and context.inputs.may_share,
         tie_points=tie_points,
     )
+
+
+def _make_mapped_database(
+    context: Context,
+) -> tuple[Path, Mapping[str, Mapping[str, int]]]:
+    """Make the database that is mapped, a copy where somebody has changed something by hand.
+
+    Returns:
+        Its path, and the keypoints of tie points: indices by image and point.
+    """
+    workspace = context.workspace
+    by_hand = context.by_hand
+    workspace.mapped_database.unlink(missing_ok=True)
+    if by_hand == NOTHING:
+        return workspace.database, {}
+    path = workspace.mapped_database
+    tie_points = by_hand.copy_database(workspace.database, path)
+    if by_hand.masks_path:  # pairs that lost matches have no geometry any more
+        sizes_px = None if workspace.is_foreign else extracted_px(context)
+        verify(path, context.verification, sizes_px)
+    return path, tie_points
 
 
 def line_cameras(context: Context) -> dict[str, LineCamera]:
