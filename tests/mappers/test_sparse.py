@@ -32,7 +32,7 @@ from colmap_affrect.mappers.tie_joining import BY_HAND
 from colmap_affrect.mappers.tie_points import (
     ImageResidual,
     TiePoints,
-    _Surroundings,
+    _NearbyDepths,
     tie_point_log_odds,
     tie_points_of,
 )
@@ -291,14 +291,14 @@ def test_what_an_image_sees_is_looked_up_once_for_all_its_marks(
         if point.has_point3D():
             keypoints[f"p{number}"] = {image_id: number}
             places[f"p{number}"] = model.points3D[point.point3D_id].xyz
-    look_up = _Surroundings._observed_by
+    look_up = _NearbyDepths._observed_by
     looked_up = list[int]()
 
-    def counted(surroundings: _Surroundings, image_id: int) -> object:
+    def counted(surroundings: _NearbyDepths, image_id: int) -> object:
         looked_up.append(image_id)
         return look_up(surroundings, image_id)
 
-    monkeypatch.setattr(_Surroundings, "_observed_by", counted)
+    monkeypatch.setattr(_NearbyDepths, "_observed_by", counted)
     found = TiePoints(keypoints).positions(model)
     assert looked_up == [image_id]
     assert len(found) > 0.9 * len(keypoints) > 100
