@@ -150,13 +150,11 @@ def test_a_mark_at_a_wrong_place_has_a_large_residual_at_once(browser: Browser) 
     assert max(residuals) > 4.0
 
 
-def test_marks_survive_a_reload_and_undo_goes_back_to_the_run(
-    browser: Browser, page: Path
-) -> None:
+def test_marks_survive_a_reload_and_undo_goes_back_to_the_run(browser: Browser) -> None:
     mark(browser, 0, 0, np.array([50.0, 40.0]))
     before = browser.run(MARKS)
     assert len(before) == 1
-    browser.open(page)
+    browser.reload()
     assert browser.run(MARKS) == before
     assert "Marks from before: 1" in browser.run(SAID, "#tie-points")
     browser.run("document.querySelector('#tie-points details').open = true")
@@ -192,7 +190,7 @@ def test_painted_masks_are_the_folder_that_mask_path_takes(
     for key in (" ", "ArrowRight", "ArrowDown", " "):
         browser.key(key)
     assert "Masks: 2 of 6" in browser.run(SAID, "#masks")
-    browser.open(page)  # what is painted survives
+    browser.reload()  # what is painted survives
     browser.run("document.querySelector('#masks details').open = true")
     browser.click("#masks [data-part=save]")
     saved = tmp_path / "masks.zip"
