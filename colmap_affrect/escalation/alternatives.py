@@ -31,7 +31,7 @@ from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.match_state import LearnedModels, Worth
 from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
-from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.report import ModelSummary, expected_right_poses
 from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.guide import guide
@@ -48,8 +48,10 @@ def num_right_poses(models: Sequence[ModelSummary]) -> float:
     >>> num_right_poses([model]), num_right_poses([model, model]), num_right_poses([])
     (1.5, 3.0, 0.0)
     """
-    expected = (sum(model.probabilities.values()) - 1.0 for model in models)
-    return sum((max(0.0, number) for number in expected), 0.0)
+    found = 0.0
+    for model in models:
+        found += expected_right_poses(model.probabilities.values())
+    return found
 
 
 def num_right_poses_now(context: Context) -> float:

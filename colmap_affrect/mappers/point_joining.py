@@ -8,7 +8,6 @@ them. Whether the whole is right the score decides, by the pairs between both mo
 import copy
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.tie_joining import MAX_SIM3_ERROR
+from colmap_affrect.mappers.tie_joining import moved_onto
 
 BY_POINTS = "joined by points of two models"  # in the words of a report
 
@@ -144,20 +143,13 @@ class PointJoiner:
         common = self._common_points(first, second)
         if len(common) < MIN_NUM_MATCHES:
             return None
-        target = _positions(first, common[:, 0])
-        source = _positions(second, common[:, 1])
-        spread = float(np.linalg.norm(np.std(target, axis=0)))
-        options = pycolmap.RANSACOptions(
-            max_error=MAX_SIM3_ERROR * spread,
-            random_seed=max(self.grower.native.random_seed, 0),
+        return moved_onto(
+            second,
+            source=_positions(second, common[:, 1]),
+            target=_positions(first, common[:, 0]),
+            min_num_inliers=max(MIN_NUM_MATCHES, MIN_SHARE * len(common)),
+            random_seed=self.grower.native.random_seed,
         )
-        found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
-        least = max(MIN_NUM_MATCHES, MIN_SHARE * len(common))
-        if not found or found["num_inliers"] < least:
-            return None
-        aligned = pycolmap.Reconstruction(second)
-        aligned.transform(found["tgt_from_src"])
-        return aligned
 
     def _common_points(
         self, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.surroundings import Places, apart
-from colmap_affrect.project.report import DOUBTFUL
+from colmap_affrect.project.report import DOUBTFUL, expected_right_poses
 
 MIN_PART = 2  # photographs that make a model; theory
 
@@ -45,14 +45,9 @@ def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
     expected = 0.0
     for part in apart(_copied(mapped), cut):
         if part.reconstruction.num_reg_images() >= MIN_PART:
-            expected += _expected_right(score(part))
-    return cut if expected > _expected_right(together) else places
+            expected += expected_right_poses(score(part).values())
+    return cut if expected > expected_right_poses(together.values()) else places
 
 
 def _copied(mapped: MappedModel) -> MappedModel:
     return replace(mapped, reconstruction=copy.deepcopy(mapped.reconstruction))
-
-
-def _expected_right(probabilities: Probabilities) -> float:
-    """Return how many poses relative to a first image are expected to be right."""
-    return max(0.0, sum(probabilities.values()) - 1.0)

@@ -202,14 +202,13 @@ class TieJoiner:
             return None
         source = np.array([own[name] for name in names])
         target = np.array([positions[name] for name in names])
-        spread = float(np.linalg.norm(np.std(target, axis=0)))
-        options = self._ransac(MAX_SIM3_ERROR * spread)
-        found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
-        if not found or found["num_inliers"] < MIN_NUM_POINTS:
-            return None
-        aligned = pycolmap.Reconstruction(other)
-        aligned.transform(found["tgt_from_src"])
-        return aligned
+        return moved_onto(
+            other,
+            source=source,
+            target=target,
+            min_num_inliers=MIN_NUM_POINTS,
+            random_seed=self.grower.native.random_seed,
+        )
 
     def _resected(
         self,
@@ -294,8 +293,40 @@ class TieJoiner:
         return _Resection(pose, camera, found["num_inliers"], focal_cost)
 
     def _ransac(self, max_error: float) -> pycolmap.RANSACOptions:
-        seed = max(self.grower.native.random_seed, 0)
-        return pycolmap.RANSACOptions(max_error=max_error, random_seed=seed)
+        return _ransac_options(max_error, self.grower.native.random_seed)
+
+
+def moved_onto(
+    model: pycolmap.Reconstruction,
+    source: Array,
+    target: Array,
+    min_num_inliers: float,
+    random_seed: int,
+) -> pycolmap.Reconstruction | None:
+    """Return a copy of a model, moved by a similarity that points of it and others tell.
+
+    Args:
+        model: It stays as it is.
+        source: (N, 3) positions in the model.
+        target: (N, 3) positions of the same points where it is moved to.
+        min_num_inliers: Points that must agree.
+        random_seed: Of RANSAC.
+
+    Returns:
+        The copy; None where too few points agree on a similarity.
+    """
+    spread = float(np.linalg.norm(np.std(target, axis=0)))
+    options = _ransac_options(MAX_SIM3_ERROR * spread, random_seed)
+    found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
+    if not found or found["num_inliers"] < min_num_inliers:
+        return None
+    moved = pycolmap.Reconstruction(model)
+    moved.transform(found["tgt_from_src"])
+    return moved
+
+
+def _ransac_options(max_error: float, random_seed: int) -> pycolmap.RANSACOptions:
+    return pycolmap.RANSACOptions(max_error=max_error, random_seed=max(random_seed, 0))
 
 
 def _with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:

@@ -50,6 +50,15 @@ def kept_probability(probability: float) -> float:
     return min(math.floor(1000.0 * probability + 1e-9) / 1000.0, MOST_CERTAIN)
 
 
+def expected_right_poses(probabilities: Iterable[float]) -> float:
+    """Return how many poses of a model, relative to a first image, are expected to be right.
+
+    >>> expected_right_poses([1.0, 1.0, 0.5]), expected_right_poses([])
+    (1.5, 0.0)
+    """
+    return max(0.0, sum(probabilities) - 1.0)
+
+
 def probability_text(probability: float) -> str:
     """Return a probability in percent: rounded down, and never 0 or 100.
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from unlike_cameras import LONG, POSE, WIDE
 
-from colmap_affrect.colmap import moved_keypoints, pycolmap
+from colmap_affrect.colmap import moved_keypoints
 from colmap_affrect.colmap.moved_keypoints import (
     _errors_of_rays,
     _fitting_share,
@@ -18,16 +19,6 @@ from colmap_affrect.colmap.moved_keypoints import (
 )
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.geometry.two_views import essential_matrix
-
-WIDE = pycolmap.Camera(
-    model="SIMPLE_RADIAL", width=900, height=600, params=[500.0, 430.0, 310.0, -0.08]
-)
-LONG = pycolmap.Camera(
-    model="SIMPLE_RADIAL", width=700, height=1000, params=[1400.0, 345.0, 560.0, 0.15]
-)
-POSE = pycolmap.Rigid3d(
-    pycolmap.Rotation3d(np.array([0.05, -0.2, 0.03])), np.array([0.9, -0.2, 0.4])
-)
 
 
 def test_matches_of_unlike_cameras_fit_their_essential_matrix() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from strategies import Array
+from unlike_cameras import LONG, POSE, WIDE
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import (
@@ -14,16 +15,6 @@ from colmap_affrect.colmap.two_views import (
     undistorted,
 )
 from colmap_affrect.geometry.two_views import essential_matrix
-
-WIDE = pycolmap.Camera(
-    model="SIMPLE_RADIAL", width=900, height=600, params=[500.0, 430.0, 310.0, -0.08]
-)
-LONG = pycolmap.Camera(
-    model="SIMPLE_RADIAL", width=700, height=1000, params=[1400.0, 345.0, 560.0, 0.15]
-)
-POSE = pycolmap.Rigid3d(
-    pycolmap.Rotation3d(np.array([0.05, -0.2, 0.03])), np.array([0.9, -0.2, 0.4])
-)
 
 
 def points_of_a_scene() -> Array:
