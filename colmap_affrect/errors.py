@@ -115,6 +115,16 @@ def with_arguments(words: Words) -> str:
     return _in_words(words, lambda option: option.argument)
 
 
+@dataclass(frozen=True)
+class Logged:
+    """What is logged: to programs it names arguments, and the command line has it name flags."""
+
+    words: Words
+
+    def __str__(self) -> str:
+        return with_arguments(self.words)
+
+
 def _in_words(words: Words, name_of: Callable[[Option], str]) -> str:
     if isinstance(words, tuple):
         return "".join(_in_words(part, name_of) for part in words)

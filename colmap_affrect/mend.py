@@ -23,7 +23,7 @@ from colmap_affrect.colmap.checks import (
 )
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.tables import damage_of, rows_digest
-from colmap_affrect.errors import AffrectError, with_flags
+from colmap_affrect.errors import AffrectError, Logged, Words
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
@@ -42,15 +42,15 @@ class Loss:
     """Why a database is not what the last command left."""
 
     kind: Literal["missing", "changed", "unusable"]
-    fault: str = ""  # that makes it unusable
+    fault: Words = ""  # that makes it unusable
 
-    def text(self) -> str:
+    def words(self) -> Words:
         """Return it in words."""
         if self.kind == "missing":
             return "is missing"
         if self.kind == "changed":
             return "was changed since the last run"
-        return f"cannot be used ({self.fault})"
+        return ("cannot be used (", self.fault, ")")
 
 
 CHANGED = Loss("changed")
@@ -110,7 +110,9 @@ def _take_as_it_is(context: Context) -> None:
     """Have a database mapped that another program has changed."""
     workspace = context.workspace
     refuse_unusable(workspace.database, FATAL_AS_IT_IS)
-    logger.warning("%s: %s, and is mapped as it is", workspace.database, CHANGED.text())
+    logger.warning(
+        "%s: %s, and is mapped as it is", workspace.database, CHANGED.words()
+    )
     workspace.is_changed = True
     record_cameras(context.graph.cameras, workspace.cameras)
 
@@ -150,7 +152,7 @@ def _loss_of(workspace: Workspace) -> Loss | None:
         # A command was killed: is what it wrote good?
         refuse_unusable(path, FATAL_AS_IT_IS)
     except AffrectError as error:
-        return CHANGED if sealed else Loss("unusable", with_flags(error.what))
+        return CHANGED if sealed else Loss("unusable", error.what)
     return None
 
 
@@ -171,7 +173,7 @@ def _make_again(context: Context, loss: Loss, *, follows: bool) -> None:
     logger.warning(
         "%s: %s; it is made again from %s%s",
         workspace.database,
-        loss.text(),
+        Logged(loss.words()),
         source,
         hint,
     )

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import ast
+import logging
 import re
 from functools import cache
 from pathlib import Path
 
 import colmap_affrect
 from colmap_affrect import errors
+from colmap_affrect.cli import _OneLine
 from colmap_affrect.cli.flags import FLAGS
-from colmap_affrect.errors import AffrectError, Option, Row, with_arguments, with_flags
+from colmap_affrect.errors import (
+    AffrectError,
+    Logged,
+    Option,
+    OptionError,
+    Row,
+    with_arguments,
+    with_flags,
+)
 
 PACKAGE = Path(colmap_affrect.__file__).parent
 OURS = {
@@ -18,6 +28,7 @@ OURS = {
     for name, value in vars(errors).items()
     if isinstance(value, type) and issubclass(value, AffrectError)
 }
+LOGGING = ("warning", "error")  # methods of a logger
 # In front of a command flags keep their dashes; so do messages of the command line itself
 FLAG = re.compile(r"(?<!\w)--[a-z]")
 COMMAND = re.compile(r"(?:colmap-affrect|colmap|pip|see) [^';)]*")
@@ -25,16 +36,16 @@ COMMAND = re.compile(r"(?:colmap-affrect|colmap|pip|see) [^';)]*")
 
 @cache
 def calls() -> list[tuple[str, str, ast.Call]]:
-    """Return all calls of the package that name an error or an option, with name and place."""
+    """Return all calls that make an error or an option, or that log, with name and place."""
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
         source = path.read_text(encoding="utf-8")
-        if "Error(" not in source and "Option(" not in source:
+        if not any(f"{name}(" in source for name in ("Error", "Option", *LOGGING)):
             continue
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Call):
                 name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-                if name in OURS or name == "Option":
+                if name in {*OURS, *LOGGING, "Option"}:
                     found.append((name, f"{path}:{node.lineno}", node))
     return found
 
@@ -64,6 +75,25 @@ def test_errors_are_raised_in_parts_and_options_are_data() -> None:
             (what,) = texts_of(call.args[0])
             has_example = "; the first: " in what or "; known are " in what
             assert "; " not in what or has_example, place
+
+
+def test_what_is_logged_holds_options_as_data() -> None:
+    logged = [item for item in calls() if item[0] in LOGGING]
+    assert len(logged) > 20
+    for _, place, call in logged:
+        texts = [COMMAND.sub("", text) for text in texts_of(call)]
+        assert not any(FLAG.search(text) for text in texts), place
+
+
+def test_log_of_the_command_line_names_flags_and_that_of_programs_arguments() -> None:
+    said = ("raise ", Option("max-distance-m"))
+    arguments = ("gps", Logged(said), OptionError("no", where=Option("gps", "a.db")))
+    record = logging.LogRecord(
+        "x", logging.WARNING, "x.py", 1, "%s: %s; %s", arguments, None
+    )
+    flags = "gps: raise --max-distance-m; --gps a.db: no"
+    assert _OneLine("%(message)s").format(record) == flags
+    assert record.getMessage().startswith("gps: raise pairs.max_distance_m; ")
 
 
 def test_options_in_errors_are_flags_of_the_command_line() -> None:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, suppress
+from copy import copy
 from pathlib import Path
 from typing import TextIO
 
@@ -156,10 +157,26 @@ def _remove_unless_used(folder: Path) -> None:
 
 
 class _OneLine(logging.Formatter):
-    """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
+    """Shows a message in one line, whatever names are in it; a traceback keeps its lines.
+
+    Options are flags in it.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        said = copy(record)
+        if isinstance(record.args, tuple):
+            said.args = tuple(map(_with_flags, record.args))
+        return super().format(said)
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return errors.clipped(errors.one_line(super().formatMessage(record)))
+
+
+def _with_flags(argument: object) -> object:
+    """Return what a log says of an argument of a message."""
+    if isinstance(argument, errors.AffrectError | errors.Logged):
+        return errors.with_flags(argument.words)
+    return argument
 
 
 class _Log(logging.StreamHandler[TextIO]):

@@ -29,6 +29,7 @@ from colmap_affrect.errors import (
     Option,
     OptionError,
     such_as,
+    with_flags,
 )
 from colmap_affrect.evaluation import evaluate as evaluating
 from colmap_affrect.evaluation.evaluate import EvaluateOptions
@@ -296,7 +297,7 @@ def _print_reconstruction(
     show(
         report.to_json()
         if options.json
-        else report.summary(with_warnings=options.quiet)
+        else report.summary(with_warnings=options.quiet, said=with_flags)
     )
     workspace = Workspace(options.output_path)
     if not (options.json or options.quiet):

@@ -308,14 +308,16 @@ def write_keypoints(
     count = database.num_keypoints_for_image(image_id)
     exists = database.exists_keypoints(image_id)
     if exists and count not in level_ends:
+        name = database.read_image(image_id).name
         raise DatabaseError(
-            f"image {image_id} has {count} keypoints in the database and "
+            f"{name} has {count} keypoints in the database and "
             f"{len(lafs)} in the feature file",
             advice=("run extract again with ", Option("overwrite")),
         )
     keypoints = colmap_keypoints(lafs)
     if not np.isfinite(keypoints).all():
-        raise DatabaseError("keypoints are not finite", where=f"image {image_id}")
+        name = database.read_image(image_id).name
+        raise DatabaseError("keypoints are not finite", where=name)
     if exists:
         database.update_keypoints(image_id, keypoints)
     else:
@@ -462,7 +464,8 @@ def _check_indices(
     """Refuse matches that are not (M, 2) numbers of keypoints of two images."""
     image_id1, image_id2 = image_ids
     if image_id1 == image_id2:
-        raise DatabaseError(f"image {image_id1} cannot be matched with itself")
+        name = database.read_image(image_id1).name
+        raise DatabaseError(f"{name} cannot be matched with itself")
     are_pairs = indices.ndim == 2 and indices.shape[1] == 2
     if not are_pairs or not np.issubdtype(indices.dtype, np.integer):
         raise DatabaseError(
@@ -476,8 +479,9 @@ def _check_indices(
     ]
     largest = indices.max(axis=0)
     if indices.min() < 0 or (largest >= counts).any():
+        names = f"{database.read_image(image_id1).name}, {database.read_image(image_id2).name}"
         raise DatabaseError(
-            f"matches of images {image_id1}, {image_id2} point at keypoints that do "
-            f"not exist (largest {largest.tolist()}, keypoints {counts})",
+            f"matches of {names} point at keypoints that do not exist (largest "
+            f"{largest.tolist()}, keypoints {counts})",
             advice="match them again",
         )

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from colmap_affrect.colmap.verification import PairVerifier
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import Logged, such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
 from colmap_affrect.escalation.policy import (
     Plan,
@@ -253,7 +253,7 @@ class Escalation:
         if self.is_over_time:
             warned.append(StageWarning("time_over", "time"))
         for warning in warned:
-            logger.warning("%s", warning.line())
+            logger.warning("%s", Logged(warning.line))
         return StageReport(
             name="escalate",
             wall_s=self.report.wall_s,

@@ -25,7 +25,7 @@ from colmap_affrect.colmap.verification import (
     estimate_geometry,
 )
 from colmap_affrect.comparison.methods import GivenMethods, Method, parse_methods
-from colmap_affrect.errors import AffrectError, Option, OptionError
+from colmap_affrect.errors import AffrectError, Logged, Option, OptionError
 from colmap_affrect.evaluation import truths
 from colmap_affrect.evaluation.datasets import PROTOCOLS, EvaluationPair
 from colmap_affrect.evaluation.results import (
@@ -269,7 +269,7 @@ class RecipeRun:
                 found = self._extractor.extract_file(path, name, intrinsics, missing)
             except AffrectError as error:
                 self.failed[name] = failure_of(error)
-                logger.warning("%s", self.failed[name].text())
+                logger.warning("%s", Logged(self.failed[name].words))
                 return False
             if found.not_rectified:
                 logger.warning("%s: not rectified: %s", name, found.not_rectified)

@@ -236,10 +236,9 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     files = photograph_files(image_path, IMAGE_SUFFIXES)
     names = [name for name in files if not _odd(name)]
     if not names:
-        others = "".join(f"; {warning.line()}" for warning in left_out(image_path))
-        raise OptionError(
-            f"holds no images ({', '.join(IMAGE_SUFFIXES)}){others}", where=image_path
-        )
+        others = tuple(("; ", warning.line) for warning in left_out(image_path))
+        what = (f"holds no images ({', '.join(IMAGE_SUFFIXES)})", others)
+        raise OptionError(what, where=image_path)
     return names
 
 

@@ -44,6 +44,7 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.errors import (
     ImageError,
+    Logged,
     Option,
     OptionError,
     StoreError,
@@ -218,9 +219,8 @@ def _import(
     progress: Progress,
 ) -> InterchangeReport:
     names = list_images(image_path)
-    note = InitialCameras(image_path, cameras).check(names)
-    if note:
-        logger.warning("cameras: %s", note)
+    for warning in InitialCameras(image_path, cameras).check(names):
+        logger.warning("%s", Logged(warning.line))
     with (
         # Verification may take hours, and half a database must not be left behind.
         new_results(database_path, names=names) as (new,),

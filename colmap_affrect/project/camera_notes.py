@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from colmap_affrect.errors import Option, Words
+
 MAX_LENSES = 3  # focal lengths in mm that a summary names; display
 
 
@@ -14,7 +16,7 @@ class Contradiction:
     what: str  # that may be wrong
     sources: tuple[str, ...]  # of a focal length, as ``report.json`` calls them
     by: str  # what its number is known by
-    remedy: str
+    remedy: Words
 
 
 # What the user gives is usually held; that of a database only has a prior.
@@ -23,26 +25,26 @@ CONTRADICTIONS = (
         what="EXIF",
         sources=("exif", "exif-rescaled"),
         by="by EXIF",
-        remedy="--ignore-exif leaves it out",
+        remedy=(Option("ignore-exif"), " leaves it out"),
     ),
     Contradiction(
         what="the given focal length",
         sources=("given",),
         by="given",
-        remedy="--cameras-path takes another one",
+        remedy=(Option("cameras-path"), " takes another one"),
     ),
 )
 # Of a focal length: three standard deviations of what EXIF usually has; theory
 MAX_EXIF_ERROR = 1.27
 
 
-def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[Words]:
     """Say where a model contradicts what was known of cameras, and what would tell lenses in mm.
 
     Args:
         cameras: entries of ``report.json``.
     """
-    notes = []
+    notes = list[Words]()
     for contradiction in CONTRADICTIONS:
         notes += _contradiction_notes(cameras, contradiction)
     notes += _principal_point_notes(cameras)
@@ -57,15 +59,20 @@ def camera_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
     if known_mm:
         texts = ", ".join(f"{mm:g}" for mm in known_mm[:MAX_LENSES])
         notes.append(
-            f"EXIF has {texts} mm, and not the size of the sensor: --focal-mm {known_mm[0]:g} "
-            "--film-width-mm WIDTH (its longer side) tells the focal length"
+            (
+                f"EXIF has {texts} mm, and not the size of the sensor: ",
+                Option("focal-mm", f"{known_mm[0]:g}"),
+                " and ",
+                Option("film-width-mm"),
+                " (its longer side) tell the focal length",
+            )
         )
     return notes
 
 
 def _contradiction_notes(
     cameras: Sequence[Mapping[str, Any]], contradiction: Contradiction
-) -> list[str]:
+) -> list[Words]:
     """Return a line where models are far from the focal lengths of some sources."""
     sources = contradiction.sources
     wrong = [camera for camera in cameras if _is_contradicted(camera, sources)]
@@ -74,13 +81,14 @@ def _contradiction_notes(
     known_px = wrong[0]["focal_px"]
     estimated_px = wrong[0]["refined_px"]
     more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-    return [
+    differs = (
         f"{contradiction.what} may be wrong: {known_px:.0f} px {contradiction.by}, "
-        f"{estimated_px:.0f} px in the model{more}; {contradiction.remedy}"
-    ]
+        f"{estimated_px:.0f} px in the model{more}; "
+    )
+    return [(differs, contradiction.remedy)]
 
 
-def _principal_point_notes(cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+def _principal_point_notes(cameras: Sequence[Mapping[str, Any]]) -> list[Words]:
     """Return a line where points of the model contradict given principal points."""
     wrong = [camera for camera in cameras if camera.get("fitting_principal_point_px")]
     if not wrong:

@@ -5,12 +5,12 @@ import json
 import math
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from typing import Any
 
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import Words, such_as, with_arguments
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
@@ -425,8 +425,18 @@ class ReconstructionReport(Summarized):
         """Return ``report.json`` as text."""
         return json.dumps(self.to_mapping(), indent=2, ensure_ascii=False) + "\n"
 
-    def summary(self, *, with_warnings: bool = True) -> str:
-        """Return one screen of text."""
+    def summary(
+        self,
+        *,
+        with_warnings: bool = True,
+        said: Callable[[Words], str] = with_arguments,
+    ) -> str:
+        """Return one screen of text.
+
+        Args:
+            with_warnings: whether it has what stages warned of, which they have logged.
+            said: what options are called: :func:`with_arguments`, or :func:`with_flags`.
+        """
         lines = [
             f"registered  {len(self.registered_names)} of {self.images_total} images",
             *self._extension_lines(),
@@ -434,12 +444,12 @@ class ReconstructionReport(Summarized):
             f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified",
             *_some(f"by hand     {text}" for text in self.by_hand),
             *self._matching_lines(),
-            *self._camera_lines(),
+            *self._camera_lines(said),
             *self._model_lines(),
             *self._preset_lines(),
         ]
         if with_warnings:
-            warnings = self.warnings_with_flags().items()
+            warnings = self.stage_warnings(said).items()
             lines += _some(f"warning     {name}: {why}" for name, why in warnings)
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines.append(f"seconds     {seconds}")
@@ -448,10 +458,10 @@ class ReconstructionReport(Summarized):
             lines.append("try         " + "\n            ".join(texts))
         return "\n".join(lines)
 
-    def warnings_with_flags(self) -> dict[str, str]:
-        """Return the warnings as pages and the terminal show them."""
+    def stage_warnings(self, said: Callable[[Words], str]) -> dict[str, str]:
+        """Return what stages warned of, by what it is about."""
         of_stages = (stage.warned for stage in self.stages)
-        return texts_by_subject(itertools.chain.from_iterable(of_stages))
+        return texts_by_subject(itertools.chain.from_iterable(of_stages), said)
 
     def _extension_lines(self) -> list[str]:
         if not self.extended:
@@ -483,7 +493,7 @@ class ReconstructionReport(Summarized):
             lines.append(f"again       {texts} (effort {self.effort})")
         return lines
 
-    def _camera_lines(self) -> list[str]:
+    def _camera_lines(self, said: Callable[[Words], str]) -> list[str]:
         """Return where focal lengths are from, and what may be wrong of them."""
         if not self.cameras:
             return []
@@ -492,7 +502,7 @@ class ReconstructionReport(Summarized):
         texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
         return [
             f"cameras     focal lengths: {', '.join(texts)}",
-            *[f"            {note}" for note in camera_notes(self.cameras)],
+            *[f"            {said(note)}" for note in camera_notes(self.cameras)],
         ]
 
     def _model_lines(self) -> list[str]:

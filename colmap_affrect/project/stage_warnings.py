@@ -142,9 +142,10 @@ class StageWarning:
         """Return it in words, without what it is about, to who gives commands."""
         return with_flags(self.words)
 
-    def line(self) -> str:
-        """Return it in words, in one line."""
-        return f"{self.about}: {self.text()}"
+    @property
+    def line(self) -> Words:
+        """All that is said of it, in one line."""
+        return (self.about, ": ", self.words)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` has of it."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import GrayImage, Mask
-from colmap_affrect.errors import ImageError, OptionError, shown, with_flags
+from colmap_affrect.errors import ImageError, OptionError, shown
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.conventions import HALF_PIXEL
@@ -137,7 +137,7 @@ def report_lines(
         try:
             gray = read_gray(path)
         except ImageError as error:
-            logger.warning("%s", with_flags(error.words))
+            logger.warning("%s", error)
             found.failed[str(path)] = failure_of(error)
             continue
         lines = lines_of(gray)

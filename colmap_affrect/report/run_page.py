@@ -11,7 +11,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import Marks
-from colmap_affrect.errors import such_as
+from colmap_affrect.errors import such_as, with_flags
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT, Progress
@@ -35,7 +35,7 @@ from colmap_affrect.report.photographs import (
     quality_of,
 )
 from colmap_affrect.report.pictures import base64_text
-from colmap_affrect.report.run_report import RunReport, contradiction_text
+from colmap_affrect.report.run_report import RunReport, contradiction_words
 from colmap_affrect.report.scene import View3D, max_num_observations, read_view
 from colmap_affrect.report.verdict import QUALITIES, SIGNS, tool_of, verdict_of
 from colmap_affrect.report.why_not_sure import groups_of
@@ -203,13 +203,13 @@ def _content(
         "signs": SIGNS,
         "photographs": [(name, photographs[name]) for name in names[:MAX_NUM_CAMERAS]],
         "contradictions": [
-            contradiction_text(one) for one in report.focal_contradictions
+            with_flags(contradiction_words(one)) for one in report.focal_contradictions
         ],
         "why_no_model": _why_no_model(report),
         "reasons": groups_of(names, report.models, report.unregistered),
         "after_next_run": _command_to_compare(report.output_path),
         "notes": [
-            f"{name}: {why}" for name, why in report.warnings_with_flags().items()
+            f"{name}: {why}" for name, why in report.stage_warnings(with_flags).items()
         ],
         "max_num_lines": MAX_LINES,
         "max_num_named": MAX_NUM_NAMED,
@@ -315,7 +315,7 @@ def _cameras(report: RunReport, names: Sequence[str]) -> dict[str, Any]:
         "is_cut": len(mapped) > MAX_NUM_CAMERAS,
         "source_counts": Counter(one["source"] for one in report.cameras).most_common(),
         "source_texts": SOURCES,
-        "camera_notes": camera_notes(report.cameras),
+        "camera_notes": list(map(with_flags, camera_notes(report.cameras))),
     }
 
 

@@ -1,7 +1,7 @@
 """What a run returns: its report, its models, and how a notebook shows it."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -9,7 +9,15 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord, read_camera_records
-from colmap_affrect.errors import NoModelError, OptionError, shown, such_as
+from colmap_affrect.errors import (
+    NoModelError,
+    Option,
+    OptionError,
+    Words,
+    shown,
+    such_as,
+    with_arguments,
+)
 from colmap_affrect.geometry.lines import LineCamera, Lines
 from colmap_affrect.mappers.camera_priors import (
     FocalContradiction,
@@ -79,11 +87,16 @@ class RunReport(ReconstructionReport):
         del content["output_path"]  # a folder may be moved
         return content
 
-    def summary(self, *, with_warnings: bool = True) -> str:
-        """Return one screen of text."""
-        lines = [super().summary(with_warnings=with_warnings)]
+    def summary(
+        self,
+        *,
+        with_warnings: bool = True,
+        said: Callable[[Words], str] = with_arguments,
+    ) -> str:
+        """Return one screen of text; see :meth:`ReconstructionReport.summary`."""
+        lines = [super().summary(with_warnings=with_warnings, said=said)]
         for one in self.focal_contradictions[:MAX_LINES]:
-            lines.append(f"lines       {contradiction_text(one)}")
+            lines.append(f"lines       {said(contradiction_words(one))}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:
@@ -234,19 +247,18 @@ def contradictions_of_report(
     return tuple(focal_contradictions(cameras.values(), records, line_cameras))
 
 
-def contradiction_text(found: FocalContradiction) -> str:
+def contradiction_words(found: FocalContradiction) -> Words:
     """Say what lines contradict, and what helps."""
     is_given = found.source == "given"
-    remedy = (
-        "--cameras-path takes another one"
-        if is_given
-        else "--ignore-exif leaves it out"
-    )
+    remedy: Words = (Option("ignore-exif"), " leaves it out")
+    if is_given:
+        remedy = (Option("cameras-path"), " takes another one")
     source = "given" if is_given else SOURCES.get(found.source, found.source)
-    return (
+    differs = (
         f"{such_as(found.names)}: the focal length {source} is {found.said_px:,.0f} px, straight "
-        f"lines tell {found.lines_px:,.0f} px +-{found.lines_sigma:.0%}; {remedy}"
+        f"lines tell {found.lines_px:,.0f} px +-{found.lines_sigma:.0%}; "
     )
+    return (differs, remedy)
 
 
 def _extended(record: CameraRecord, before: Sequence[str]) -> CameraRecord:

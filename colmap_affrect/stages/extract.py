@@ -12,6 +12,7 @@ from colmap_affrect.errors import (
     ConflictError,
     DatabaseError,
     ImageError,
+    Logged,
     Option,
     StoreError,
     one_line,
@@ -203,7 +204,7 @@ def _warnings_of_the_folder(inputs: Inputs, names: Sequence[str]) -> list[StageW
 def _log_warnings(warned: Iterable[StageWarning]) -> None:
     """Log what the user should know of the photographs."""
     for warning in warned:
-        logger.warning("%s", warning.line())
+        logger.warning("%s", Logged(warning.line))
 
 
 def _extract_missing(
@@ -226,7 +227,7 @@ def _extract_missing(
     ):
         for name, found in zip(names, found_images, strict=True):
             if isinstance(found, UnusableImageError):
-                logger.warning("%s", found.failure.text())
+                logger.warning("%s", Logged(found.failure.words))
                 failures[name] = found.failure
             else:
                 if not len(found.features):

@@ -23,7 +23,7 @@ from colmap_affrect.colmap.database_copy import (
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError, Option, OptionError
+from colmap_affrect.errors import DatabaseError, Logged, Option, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.given_matches import MatchType, given_matches
@@ -178,7 +178,7 @@ def _update_copy(
     if digest != before:
         if before:
             warning = StageWarning("database_changed", str(source))
-            logger.warning("%s", warning.line())
+            logger.warning("%s", Logged(warning.line))
             warned = (warning,)
         workspace.rewind()
         context.graph.forget()

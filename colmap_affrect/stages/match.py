@@ -21,7 +21,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from colmap_affrect.errors import Option, OptionError, PartError, StoreError, such_as
+from colmap_affrect.errors import (
+    Logged,
+    Option,
+    OptionError,
+    PartError,
+    StoreError,
+    such_as,
+)
 from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.geometry.neighbors import num_consistent_matches
@@ -166,7 +173,7 @@ def _match_missing(
     if has_new and options.filter_stationary_matches:
         warned = StationaryFilter(context.features, matches).learn(pairs)
         for warning in warned:
-            logger.warning("%s", warning.line())
+            logger.warning("%s", Logged(warning.line))
     if finished != digest:
         matches.update_state(listed=digest)
     return _Missing(len(missing), tuple(warned))

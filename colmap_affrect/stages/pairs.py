@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import AffrectError, Option, such_as, with_flags
+from colmap_affrect.errors import AffrectError, Logged, Option, such_as
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
@@ -21,9 +21,11 @@ from colmap_affrect.session.database_export import write_images_and_keypoints
 logger = logging.getLogger(__name__)
 
 MANY_IMAGES = 300  # resource
-MANY_PAIRS = (
-    "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
-    "(see --num-neighbors)"
+FEWER_PAIRS = (
+    Option("pairs", "retrieval"),
+    " matches the promising ones only (see ",
+    Option("num-neighbors"),
+    ")",
 )
 
 
@@ -81,7 +83,12 @@ def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) 
     num_pairs = math.comb(len(names), 2)
     # 45,000 pairs are too many to wait for; of mapping it says nothing
     if len(names) > MANY_IMAGES:
-        logger.warning(MANY_PAIRS, len(names), num_pairs)
+        logger.warning(
+            "all pairs of %d images are %d; %s",
+            len(names),
+            num_pairs,
+            Logged(FEWER_PAIRS),
+        )
     workspace.record_options("pairs", options=options.to_mapping(), overwrite=overwrite)
     lists.write_pairs(
         workspace.pairs,
@@ -145,7 +152,7 @@ def _warn_of_images_without_neighbors(
             len(names),
             near,
             such_as(lonely),
-            with_flags(advice),
+            Logged(advice),
         )
 
 
@@ -196,5 +203,5 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> tuple[StageWarning
         str(context.workspace.pairs),
         {"num": len(lost), "first": first, "second": second},
     )
-    logger.warning("%s", warning.line())
+    logger.warning("%s", Logged(warning.line))
     return (warning,)

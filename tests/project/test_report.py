@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from colmap_affrect.errors import with_flags
 from colmap_affrect.project.camera_notes import merge_shared_cameras
 from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
@@ -17,6 +18,7 @@ from colmap_affrect.project.report import (
     ReconstructionReport,
 )
 from colmap_affrect.project.stage_report import StageReport
+from colmap_affrect.project.stage_warnings import StageWarning
 
 LARGE = ModelSummary(
     ("a.png", "č d.png"),
@@ -162,24 +164,43 @@ def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> N
     }
     right = {**camera, "id": 2, "refined_px": 280.0}
     lens = {**camera, "id": 3, "source": "guess", "lens_mm": 35.0}
-    text = replace(REPORT, cameras=(camera, right, lens)).summary()
+    text = replace(REPORT, cameras=(camera, right, lens)).summary(said=with_flags)
     assert "cameras     focal lengths: 2 from EXIF, 1 not known beforehand\n" in text
     assert (
         "            EXIF may be wrong: 270 px by EXIF, 1081 px in the model; --ignore"
         in text
     )
-    assert (
-        "EXIF has 35 mm, and not the size of the sensor: --focal-mm 35 --film-width-mm"
-        in text
-    )
+    assert "not the size of the sensor: --focal-mm 35 and --film-width-mm (its" in text
     text = replace(REPORT, cameras=(right, {**right, "refined_px": None})).summary()
     assert "EXIF may be wrong" not in text
     assert "sensor" not in text
     database = {**camera, "source": "given", "focal_px": 2560.0, "refined_px": 1279.0}
-    text = replace(REPORT, cameras=(database, {**right, "source": "given"})).summary()
+    text = replace(REPORT, cameras=(database, {**right, "source": "given"})).summary(
+        said=with_flags
+    )
     line = "the given focal length may be wrong: 2560 px given, 1279 px in the model; --cameras"
     assert line in text
     assert "EXIF" not in text
+
+
+def test_summary_names_arguments_to_who_calls_functions() -> None:
+    known = {"source": "exif", "focal_px": 270.0, "refined_px": 1081.2, "lens_mm": 35.0}
+    given = {**known, "source": "given"}
+    warned = StageWarning("time_over", "time")
+    text = replace(
+        REPORT,
+        cameras=({**known, "id": 1}, {**given, "id": 2}),
+        stages=(StageReport("map", 0.5, 1, warned=(warned,)),),
+        advice=(),
+    ).summary()
+    assert "--" not in text
+    for argument in (
+        "cameras.ignore_exif leaves it out",
+        "cameras.cameras_path takes another one",
+        "cameras.focal_mm 35 and cameras.film_width_mm (its",
+        "without max_minutes tries more",
+    ):
+        assert argument in text
 
 
 def test_summary_says_what_cannot_be_trusted() -> None:

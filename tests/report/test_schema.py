@@ -11,6 +11,7 @@ import pydantic
 import pytest
 from small_run import NAMES, make_run_page, small_report
 
+from colmap_affrect.errors import with_flags
 from colmap_affrect.mappers.camera_priors import FocalContradiction
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.report import MatchedAgain, Residual
@@ -85,9 +86,10 @@ def test_the_schema_in_the_documentation_is_the_one_of_the_code() -> None:
 
 
 def test_contradicted_focal_lengths_are_told_in_the_terminal(report: RunReport) -> None:
-    text = report.summary()
+    text = report.summary(said=with_flags)
     assert "the focal length from EXIF is 900 px, straight lines tell 1,400 px" in text
     assert "--ignore-exif leaves it out" in text
+    assert "cameras.ignore_exif leaves it out" in str(report)
 
 
 def test_contradicted_principal_points_are_told_in_the_terminal(

@@ -199,7 +199,7 @@ def test_positions_that_are_none_on_earth_do_not_count(
         "gps: 2 of 4 photographs were not taken within 100 m of another one"
         in caplog.text
     )
-    assert "; raise --max-distance-m, or choose" in caplog.text
+    assert "; raise pairs.max_distance_m, or choose" in caplog.text
 
 
 def test_no_pair_by_gps_is_an_error(rooms: Workspace) -> None:
