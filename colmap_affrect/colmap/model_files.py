@@ -5,7 +5,9 @@ So every record is followed to its end first. Models of ours have digests of fil
 """
 
 import json
+import math
 import os
+import posixpath
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,6 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect import errors
 from colmap_affrect.colmap import pycolmap
@@ -35,7 +38,11 @@ MAX_SIDE_PX = 1 << 24
 # Coordinates beyond it are no positions: nothing can be computed with them; damage
 FAR = 1e12
 MAX_TEXT_BYTES = 1 << 14  # of the name of an image: no system has longer paths; format
+# Of keypoints: where they are, and which point they see; format
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+ROWS_AT_ONCE = 1 << 16  # of keypoints that are in memory; resource
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
+NO_NAME = posixpath.normpath("")
 # File beside a model of ours, which has the digests of its files as ``model``
 SUMMARY = "summary.json"
 
@@ -65,6 +72,15 @@ class _Reader:
         start = self.skip(struct.calcsize(layout))
         self.file.seek(start)
         return struct.unpack(layout, self.file.read(struct.calcsize(layout)))
+
+    def rows(self, count: int, layout: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
+        """Yield all rows of an array, some at a time."""
+        start = self.skip(layout.itemsize * count)
+        self.file.seek(start)
+        for first in range(0, count, ROWS_AT_ONCE):
+            num_rows = min(ROWS_AT_ONCE, count - first)
+            data = self.file.read(layout.itemsize * num_rows)
+            yield np.frombuffer(data, layout)
 
     def text(self) -> str:
         """Read a text that ends with a 0."""
@@ -115,7 +131,9 @@ def _image(reader: _Reader) -> str:
     reader.take("I7dI")
     name = reader.text()
     (num_keypoints,) = reader.take("Q")
-    reader.skip(24 * num_keypoints)  # x, y, and which point they see
+    for rows in reader.rows(num_keypoints, KEYPOINT):
+        if not (np.abs(rows["xy"]) < FAR).all():
+            raise ValueError(f"a keypoint of {name} is at no finite place")
     return name
 
 
@@ -295,13 +313,19 @@ def _read_text(
     folder: Path, where: errors.Words, wanted: str
 ) -> pycolmap.Reconstruction:
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except errors.DAMAGE as error:
         if errors.lacks_memory(error):
             raise
         advice = f"{wanted} ({errors.reason(error)})"
         fault = "not a COLMAP model"
         raise errors.OptionError(fault, where=where, advice=advice) from error
+    for image in model.images.values():  # binary ones are walked through
+        for keypoint in image.points2D:
+            if not (abs(keypoint.x()) < FAR and abs(keypoint.y()) < FAR):
+                fault = f"a keypoint of {image.name} is at no finite place"
+                raise errors.StoreError(fault, where=where, advice=_mend(folder))
+    return model
 
 
 def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) -> str:
@@ -313,13 +337,15 @@ def why_unusable(model: pycolmap.Reconstruction, *, needs_poses: bool = True) ->
 
 
 def _faulty_images(model: pycolmap.Reconstruction) -> str:
-    names = Counter(image.name for image in model.images.values())
+    names = Counter(posixpath.normpath(image.name) for image in model.images.values())
     for name, count in sorted(names.items()):
         if count > 1:
             return (
                 f"two of its images are called {name} (text models cannot hold names with blanks: "
                 "use a binary one, or rename the photographs)"
             )
+    if NO_NAME in names:
+        return "one of its images has no name, or that of a folder"
     return ""
 
 
@@ -345,6 +371,8 @@ def _faulty_points(model: pycolmap.Reconstruction) -> str:
     for point_id, point in model.points3D.items():
         if not (np.abs(point.xyz) < FAR).all():
             return f"point {point_id} is at no finite place"
+        if math.isnan(point.error):
+            return f"the error of point {point_id} is no number"
     return ""
 
 

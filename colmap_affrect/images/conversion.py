@@ -38,6 +38,11 @@ from colmap_affrect.project.paths import PathLike, as_path
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 JPEG = b"\xff\xd8"
+OF_PHOTOGRAPHS = (
+    "AVIF", "BMP", "GIF", "HEIF", "JPEG", "JPEG2000", "JXL", "PNG", "PPM", "PSD", "TGA", "TIFF",
+    "WEBP",
+)  # fmt: skip
+"""Formats, as Pillow calls them. Of others it knows one is a program, which it has another run."""
 
 
 @documented
@@ -232,11 +237,17 @@ def _require_picture(path: Path, data: Bytes) -> None:
         raise unusable("damaged", path, reason=str(error)) from error
 
 
+def _known_formats() -> list[str]:
+    """Return which formats of photographs Pillow reads here."""
+    Image.init()
+    return [name for name in OF_PHOTOGRAPHS if name in Image.OPEN]
+
+
 def _as_png(path: Path, data: Bytes, numbers: Sequence[int]) -> Iterator[bytes]:
     """Yield pages of a file as PNG; ImageError if it is damaged, or of no format that is known."""
     try:
         # By its name Pillow maps a file into memory, and garbles gray pages that lie on their side.
-        with Image.open(io.BytesIO(data.data)) as image:
+        with Image.open(io.BytesIO(data.data), formats=_known_formats()) as image:
             for number in numbers:
                 image.seek(number)
                 if reading.is_too_large(image.size):

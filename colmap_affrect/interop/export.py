@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import logging
+import posixpath
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -255,6 +256,13 @@ def _check_photographs(source: Source, image_path: Path) -> None:
         if leads_outside(image.name):
             raise OptionError(
                 f"the image name {image.name} leads out of the folder of the photographs",
+                where=source.path,
+                advice="rename it, no undistorted picture can be written for it",
+            )
+        usual = posixpath.normpath(image.name)
+        if usual != image.name:  # at which COLMAP ends its process
+            raise OptionError(
+                f"the image name {image.name} is another way to write {usual}",
                 where=source.path,
                 advice="rename it, no undistorted picture can be written for it",
             )

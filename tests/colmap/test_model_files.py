@@ -137,6 +137,22 @@ def set_point(model: pycolmap.Reconstruction, x: float) -> None:
     model.points3D[min(model.points3D)].xyz = np.array([x, 0.0, 0.0])
 
 
+def set_keypoint(model: pycolmap.Reconstruction, x: float) -> None:
+    _first(model).points2D[0].xy = np.array([x, 0.0])
+
+
+def set_error(model: pycolmap.Reconstruction) -> None:
+    model.points3D[min(model.points3D)].error = NAN
+
+
+def name_one_file_twice(model: pycolmap.Reconstruction) -> None:
+    _first(model).name = f"./{model.image(max(model.reg_image_ids())).name}"
+
+
+def unname(model: pycolmap.Reconstruction) -> None:
+    _first(model).name = ""
+
+
 def deregister(model: pycolmap.Reconstruction) -> None:
     for frame_id in list(model.reg_frame_ids()):
         model.deregister_frame(frame_id)
@@ -179,6 +195,17 @@ UNSOUND: dict[str, tuple[Callable[[pycolmap.Reconstruction], None], str]] = {
         "camera 1 has no size",
     ),
     "point": (lambda model: set_point(model, NAN), "point 1 is at no finite place"),
+    "keypoint": (
+        lambda model: set_keypoint(model, NAN),
+        "a keypoint of .* is at no finite place",
+    ),
+    "keypoint far away": (
+        lambda model: set_keypoint(model, 1e300),
+        "a keypoint of .* is at no finite place",
+    ),
+    "error of a point": (set_error, "the error of point 1 is no number"),
+    "two of one file": (name_one_file_twice, "two of its images are called"),
+    "no name": (unname, "one of its images has no name"),
     "no image": (deregister, "the model has no images with poses"),
     "two of one name": (name_twice, "two of its images are called"),
 }

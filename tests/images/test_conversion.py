@@ -57,6 +57,26 @@ def scans(tmp_path: Path) -> Path:
     return folder
 
 
+def test_program_that_draws_a_picture_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow has Ghostscript run PostScript, whatever the name of the file."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    picture(1).save(folder / "a.webp")
+    program = tmp_path / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/was-run\necho 10.0\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    drawn = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 99 99\n(/etc/passwd) run\n"
+    (folder / "b.jp2").write_bytes(drawn)
+    report = convert_images(folder, tmp_path / "new")
+    assert report.failed["b.jp2"].code == "not_convertible"
+    assert list(report.written) == ["a.webp"]
+    assert not (tmp_path / "was-run").exists()
+
+
 def test_every_photograph_arrives_as_colmap_reads_it(
     scans: Path, tmp_path: Path
 ) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from command import Call, on_photographs
 from exported_model import write_model
+from exported_model import write_photographs as write_its_photographs
 from PIL import Image
 from small_scene import write_photographs
 from synthetic import texture, write_image
@@ -381,6 +382,23 @@ def test_photographs_of_another_size_are_not_exported(
     )
     assert (ended.code, len(ended.errors)) == (1, 1)
     assert "a.png: is 80 x 60 px, and its camera 160 x 120" in ended.errors[0]
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("name", ["./a.png", "side//a.png", "../a.png"])
+def test_names_that_colmap_would_end_at_are_one_line(
+    tmp_path: Path, call: Call, name: str
+) -> None:
+    model = write_model(tmp_path / "model", "PINHOLE")
+    model.image(1).name = name
+    model.write(tmp_path / "model")
+    given = ["--model-path", tmp_path / "model", "--image-path", tmp_path / "photos"]
+    write_its_photographs(tmp_path / "photos")
+    ended = call(
+        "export", *given, "--output-path", tmp_path / "new", "--format", "undistorted"
+    )
+    assert (ended.code, len(ended.errors)) == (2, 1)
+    assert f"the image name {name} " in ended.errors[0]
     assert not (tmp_path / "new").exists()
 
 
