@@ -439,10 +439,15 @@ def checked_names(image_path: Path, names: Iterable[PathLike], where: str) -> li
         The sorted names, each once.
 
     Raises:
-        OptionError: one is not below the folder.
+        OptionError: one is empty, or not below the folder.
         ImageError: one has a name that lists cannot hold.
     """
-    found = sorted({PurePosixPath(as_path(name)).as_posix() for name in names})
+    given = list(names)
+    if "" in given:
+        raise OptionError(
+            "an image has no name", where=where, advice="name it as its file is named"
+        )
+    found = sorted({PurePosixPath(as_path(name)).as_posix() for name in given})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
         odd = _odd(name)

@@ -322,7 +322,11 @@ def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is."""
     if range_of_floats(image):
         return None  # these fill the range anyway
-    low, high = np.nanpercentile(_sample(image), TONE_PERCENTILES)
+    sample = _sample(image)
+    values = sample[np.isfinite(sample)]
+    if not values.size:
+        return None
+    low, high = np.percentile(values, TONE_PERCENTILES)
     whole_numbers = np.issubdtype(image.dtype, np.integer)
     white = np.iinfo(image.dtype).max if whole_numbers else 1.0
     finest = 255 / MAX_TONE_STEP if whole_numbers else 0.0

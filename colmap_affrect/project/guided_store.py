@@ -45,8 +45,12 @@ class GuidedStore(GroupStore):
             return []
         found = []
         with self._open("r") as file:
-            for _, group in sorted(entries_of(file), key=lambda item: item[0]):
+            for key, group in sorted(entries_of(file), key=lambda item: item[0]):
                 first, second = group.attrs["names"]
+                if (
+                    pair_key(str(first), str(second)) != key
+                ):  # columns would be exchanged
+                    raise ValueError(f"{group.name} is not as it was written")
                 found.append(
                     GuidedPair(
                         names=(str(first), str(second)),

@@ -163,6 +163,15 @@ def test_floats_of_any_range_are_seen(tmp_path: Path, low: float, high: float) -
 @pytest.mark.skipif(
     not Path("/proc/self/mem").exists(), reason="only Linux has such a file"
 )
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_floats_that_are_no_numbers_are_read_without_a_warning(value: float) -> None:
+    image = np.full((40, 60), value, np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert tones(image) is None
+        assert in_eight_bits(image).std() == 0.0
+
+
 def test_a_file_whose_content_cannot_be_read_is_an_image_that_cannot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

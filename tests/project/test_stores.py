@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import StoreError
 from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.guided_store import GuidedPair, GuidedStore
 from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
 from colmap_affrect.project.match_store import (
     Learned,
@@ -325,6 +326,22 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     )  # fmt: skip
     matches.remove(pairs=pairs[:1])
     assert matches.state == MatchState(stationary=stationary, effort="high")
+
+
+@pytest.mark.parametrize("names", [NAMES[1::-1], [NAMES[0], NAMES[2]], NAMES[:1]])
+def test_guided_matches_of_other_images_than_written_are_damage(
+    tmp_path: Path, names: list[str]
+) -> None:
+    """Their columns would be those of other images."""
+    store = GuidedStore(tmp_path / "guided.h5")
+    exact = np.array([[1, 2], [3, 4]])
+    store.write([GuidedPair((NAMES[0], NAMES[1]), exact, 2)])
+    assert_array_equal(store.read()[0].exact, exact)
+    with h5py.File(store.path, "r+") as file:
+        group = file[pair_key(NAMES[0], NAMES[1])]
+        group.attrs["names"] = np.asarray(names, dtype=h5py.string_dtype())
+    with pytest.raises(StoreError, match="damaged"):
+        store.read()
 
 
 def test_state_that_is_none_is_damage(matches: MatchStore) -> None:
