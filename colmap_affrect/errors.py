@@ -42,7 +42,10 @@ def lacks_memory(error: BaseException) -> bool:
     Of some only the sentence says so: they raise RuntimeError, and no number comes with it.
     """
     text = str(error).lower()
-    return isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY)
+    if isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY):
+        return True
+    cause = error.__cause__  # pycolmap tells of a module that could not be loaded
+    return cause is not None and lacks_memory(cause)
 
 
 ARGUMENTS = {

@@ -96,6 +96,14 @@ def test_log_of_the_command_line_names_flags_and_that_of_programs_arguments() ->
     assert record.getMessage().startswith("gps: raise pairs.max_distance_m; ")
 
 
+def test_want_of_memory_is_known_by_its_cause() -> None:
+    cause = ImportError("_core.so: failed to map segment from shared object")
+    error = RuntimeError("Cannot import the C++ backend")
+    assert not errors.lacks_memory(error)
+    error.__cause__ = cause
+    assert errors.lacks_memory(error)
+
+
 def test_options_in_errors_are_flags_of_the_command_line() -> None:
     flags = set()
     for names in FLAGS:

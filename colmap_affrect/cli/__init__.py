@@ -19,6 +19,7 @@ from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger("colmap_affrect")
+of_libraries = logging.getLogger("py.warnings")
 SPEAK_THEMSELVES = ("compare", "serve")
 """Commands that other processes speak for, or that wait for a person."""
 
@@ -116,6 +117,9 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
         log.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
         logger.addHandler(shown)
         logger.addHandler(log)
+        # Nobody can do anything about what libraries warn of
+        logging.captureWarnings(True)
+        of_libraries.addHandler(log)
         logger.setLevel(logging.DEBUG)
         logger.info("colmap-affrect %s: %s", __version__, " ".join(sys.argv[1:]))
         os.dup2(log.stream.fileno(), 2)
@@ -130,6 +134,8 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
             os.dup2(terminal.fileno(), 2)
             logger.removeHandler(shown)
             logger.removeHandler(log)
+            of_libraries.removeHandler(log)
+            logging.captureWarnings(False)
 
 
 def _terminal() -> TextIO:

@@ -42,7 +42,6 @@ MAX_TEXT_BYTES = 1 << 14  # of the name of an image: no system has longer paths;
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 ROWS_AT_ONCE = 1 << 16  # of keypoints that are in memory; resource
 QUATERNION_ERROR = 1e-3  # of the length of one, which text rounds; numeric
-NO_NAME = posixpath.normpath("")
 # File beside a model of ours, which has the digests of its files as ``model``
 SUMMARY = "summary.json"
 
@@ -238,6 +237,14 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     with native_writes(folder):
         folder.mkdir()
         model.write(folder)
+    require_written(folder)
+
+
+def require_written(folder: Path) -> None:
+    """Refuse a model that pycolmap has not written to its end; WorkspaceError.
+
+    To read one would take for ever.
+    """
     try:
         registered_names(folder)
     except errors.StoreError as error:
@@ -344,8 +351,6 @@ def _faulty_images(model: pycolmap.Reconstruction) -> str:
                 f"two of its images are called {name} (text models cannot hold names with blanks: "
                 "use a binary one, or rename the photographs)"
             )
-    if NO_NAME in names:
-        return "one of its images has no name, or that of a folder"
     return ""
 
 

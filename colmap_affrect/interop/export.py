@@ -17,6 +17,7 @@ from colmap_affrect.colmap.model_files import (
     model_folder,
     read_given_model,
     refuse_panoramas,
+    require_written,
     write_model,
 )
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
@@ -239,6 +240,7 @@ def _undistorted(source: Source, folder: Path) -> Path:
     if not given.exists():
         write_model(source.model, given)
     undistort(path, given, source.image_path)
+    require_written(path / "sparse")
     for image in source.images():
         picture = path / "images" / image.name
         if not picture.is_file():
@@ -339,7 +341,8 @@ def _nerfstudio_frame(flat: Source, image: pycolmap.Image) -> dict[str, Any]:
 def _mvsnet(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs their model as text, as MVSNet's programs read it."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
-    pycolmap.Reconstruction(path / "sparse").write_text(path / "sparse")
+    with native_writes(path / "sparse"):
+        pycolmap.Reconstruction(path / "sparse").write_text(path / "sparse")
     return path
 
 

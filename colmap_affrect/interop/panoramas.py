@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
+from colmap_affrect.colmap.model_files import require_written
 from colmap_affrect.errors import ImageError, NoModelError, OptionError
 from colmap_affrect.images.exif import read_camera_tags
 from colmap_affrect.images.photographs import list_images
@@ -108,8 +109,12 @@ def reconstruct_panoramas(
     found = module.reconstruct(image_path, output_path, options)
     if not found:
         raise NoModelError(f"no two of the {len(names)} panoramas can be registered")
-    folder = output_path / "sparse_equirectangular"
-    return {number: pycolmap.Reconstruction(folder / str(number)) for number in found}
+    models = dict[int, pycolmap.Reconstruction]()
+    for number in found:
+        folder = output_path / "sparse_equirectangular" / str(number)
+        require_written(folder)
+        models[number] = pycolmap.Reconstruction(folder)
+    return models
 
 
 def _module(functions: _Functions) -> Any:

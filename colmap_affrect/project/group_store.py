@@ -73,6 +73,10 @@ class GroupStore:
         """Read all that is there; StoreError if it is damaged."""
         if self.path.exists():
             with self._open("r") as file:
+                keys = list[bytes]()
+                file.id.links.visit(keys.append)
+                for key in keys:
+                    _require_own(file.id, key)
                 for _, group in entries_of(file):
                     for name in group:  # items() has None for what cannot be opened
                         read_checked(group, name)
@@ -97,8 +101,13 @@ class GroupStore:
 
 def read_checked(group: h5py.Group, name: str) -> NDArray[Any]:
     """Read a dataset; ValueError if it does not hold what was written."""
+    key = name.encode()
+    _require_own(group.id, key)
     # This takes a third of the time of group[name]
-    dataset = h5py.h5d.open(group.id, name.encode())
+    dataset = h5py.h5d.open(group.id, key)
+    properties = dataset.get_create_plist()
+    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
+        raise ValueError(f"the data of {name} are in another file")
     require_plausible(dataset, name)
     values = np.zeros(dataset.shape, dataset.dtype)
     if values.size:
@@ -121,9 +130,24 @@ def _checksum(values: Any) -> int:
     return zlib.crc32(np.ascontiguousarray(values).data)
 
 
+def _require_own(group: h5py.h5g.GroupID, key: bytes) -> None:
+    """Refuse what is only linked, perhaps from another file; ValueError."""
+    if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
+        raise ValueError(f"{key.decode()} is linked from elsewhere")
+
+
 def has_entry(file: h5py.File, key: str) -> bool:
-    """Return whether there is an entry of this path."""
-    return key in file and len(file[key].attrs) > 0
+    """Return whether there is an entry of this path; what is linked from elsewhere is none."""
+    group = file.id
+    for part in key.encode().split(b"/"):
+        if not group.links.exists(part):
+            return False
+        if group.links.get_info(part).type != h5py.h5l.TYPE_HARD:
+            return False
+        group = h5py.h5o.open(group, part)
+        if not isinstance(group, h5py.h5g.GroupID):
+            return False
+    return int(h5py.h5a.get_num_attrs(group)) > 0
 
 
 def entries_of(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:

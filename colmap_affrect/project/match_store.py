@@ -10,6 +10,7 @@ pairs and closed again; what is written in between appears as a whole
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -77,13 +78,21 @@ class MatchStore(GroupStore):
     format = "colmap_affrect/matches"
     stage = "match"
 
+    def __init__(self, path: Path, num_levels: int | None = None) -> None:
+        """Take the file, and how many levels the recipe has, beyond which none can be."""
+        super().__init__(path)
+        self.num_levels = num_levels
+
     @property
     def state(self) -> MatchState:
         """How far matching and escalation of the whole set have come."""
         if not self.path.exists():
             return MatchState()
         with self._open("r") as file:
-            return _read_state(file)
+            state = _read_state(file)
+            for begun in (state.step, state.learned_matching):
+                self._require_level(begun.level if begun else 0)
+        return state
 
     def update_state(self, **changes: Any) -> None:
         """Change fields of the state."""
@@ -158,6 +167,8 @@ class MatchStore(GroupStore):
             for names in pairs:
                 attributes = file[pair_key(*names)].attrs
                 levels[names] = int(attributes.get(LEARNED + "level", -1))
+            highest = max(levels.values(), default=0)
+            self._require_level(max(highest, 0))  # -1 is none
         return levels
 
     def measured_worths(self, pairs: Iterable[Names]) -> dict[Names, Worth]:
@@ -250,8 +261,22 @@ class MatchStore(GroupStore):
         Returns:
             By pair a level, or a number with a bit for each level that was tried.
         """
+        found = dict[Names, int]()
         with self._open("r") as file:
-            return {pair: int(file[pair_key(*pair)].attrs[attribute]) for pair in pairs}
+            for pair in pairs:
+                found[pair] = int(file[pair_key(*pair)].attrs[attribute])
+            highest = max(found.values(), default=0)
+            if attribute == "tried":
+                highest = max(highest.bit_length() - 1, 0)
+            self._require_level(highest)
+            lowest = min(found.values(), default=0)
+            self._require_level(min(lowest, 0))
+        return found
+
+    def _require_level(self, level: int) -> None:
+        """Refuse a level that the recipe has not; ValueError."""
+        if level < 0 or (self.num_levels is not None and level >= self.num_levels):
+            raise ValueError(f"matches are of level {level}, which the recipe has not")
 
     def read(self, pairs: Sequence[Names]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""

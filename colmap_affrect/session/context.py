@@ -331,7 +331,9 @@ class Context:
     @property
     def matches(self) -> MatchStore:
         """The raw matches."""
-        return MatchStore(self.workspace.matches)
+        record = self.workspace.options_on_record("extract")
+        num_levels = 1 + len(record.get("escalation", ())) if record else None
+        return MatchStore(self.workspace.matches, num_levels)
 
     @property
     def guided(self) -> GuidedStore:

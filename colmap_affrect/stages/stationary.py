@@ -16,6 +16,7 @@ import numpy as np
 
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
 from colmap_affrect.data import Mask
+from colmap_affrect.errors import damage, how_to_make_again
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.stationary import (
     means_of_regions,
@@ -112,12 +113,16 @@ class StationaryFilter:
         self._matches = matches
         self._points = lru_cache(NUM_CACHED_IMAGES)(self._read_points)
         self._still_masks = dict[Size, Mask]()
-        self._of_still_cameras = set(matches.state.still_cameras)
-        for size, cells in matches.state.stationary:
-            self._still_masks[size] = _mask(np.array(cells, np.int64).reshape(-1, 2))
         self._backgrounds = dict[str, Mask]()
-        for name, packed in matches.state.backgrounds:
-            self._backgrounds[name] = _unpacked(packed)
+        state = matches.state
+        self._of_still_cameras = set(state.still_cameras)
+        with damage(matches.path, how_to_make_again("match", matches.path.parent)):
+            for size, cells in state.stationary:
+                self._still_masks[size] = _mask(
+                    np.array(cells, np.int64).reshape(-1, 2)
+                )
+            for name, packed in state.backgrounds:
+                self._backgrounds[name] = _unpacked(packed)
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:

@@ -6,14 +6,16 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
 from small_scene import write_photographs
 
-from colmap_affrect.cli import main
+from colmap_affrect.cli import commands, main
 from colmap_affrect.colmap.model_files import model_poses
+from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers import scored_models
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.reliability import Confidence
@@ -71,6 +73,23 @@ def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
     log = (tmp_path / "out" / "run.log").read_text()
     assert "Traceback" in log
     assert "OptionError" in log
+
+
+def test_what_libraries_warn_of_is_in_the_log_alone(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warn(*_: object, **__: object) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.warn("tag 256\nis odd", UserWarning, stacklevel=1)
+        raise OptionError("no")
+
+    monkeypatch.setattr(commands, "stage", warn)
+    (tmp_path / "out").mkdir()
+    done = call("match", "--output-path", tmp_path / "out")
+    assert done.stderr == ["error: no"]
+    log = (tmp_path / "out" / "run.log").read_text()
+    assert "UserWarning: tag 256\\u000ais odd" in log
 
 
 def test_page_is_written_unless_it_is_left_out(verified: Path, call: Call) -> None:

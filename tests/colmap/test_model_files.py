@@ -149,10 +149,6 @@ def name_one_file_twice(model: pycolmap.Reconstruction) -> None:
     _first(model).name = f"./{model.image(max(model.reg_image_ids())).name}"
 
 
-def unname(model: pycolmap.Reconstruction) -> None:
-    _first(model).name = ""
-
-
 def deregister(model: pycolmap.Reconstruction) -> None:
     for frame_id in list(model.reg_frame_ids()):
         model.deregister_frame(frame_id)
@@ -205,7 +201,6 @@ UNSOUND: dict[str, tuple[Callable[[pycolmap.Reconstruction], None], str]] = {
     ),
     "error of a point": (set_error, "the error of point 1 is no number"),
     "two of one file": (name_one_file_twice, "two of its images are called"),
-    "no name": (unname, "one of its images has no name"),
     "no image": (deregister, "the model has no images with poses"),
     "two of one name": (name_twice, "two of its images are called"),
 }

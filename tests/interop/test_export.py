@@ -18,6 +18,7 @@ from filelock import FileLock
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, ImageError, OptionError, WorkspaceError
+from colmap_affrect.interop import export as exporting
 from colmap_affrect.interop.export import FORMATS, export
 
 
@@ -209,6 +210,27 @@ def test_pipes_among_the_files_of_a_model_are_refused(
         export(tmp_path / "model", tmp_path / "out", ["ply"])
 
 
+@pytest.mark.parametrize("form", ["undistorted", "nerfstudio", "mvsnet"])
+def test_undistorted_model_that_a_full_disk_has_cut_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    """pycolmap would read it for ever."""
+
+    def cut(path: Path, model_path: Path, image_path: Path) -> None:
+        shutil.copytree(image_path, path / "images")
+        shutil.copytree(model_path, path / "sparse")
+        os.truncate(path / "sparse" / "points3D.bin", 100)
+
+    monkeypatch.setattr(exporting, "undistort", cut)
+    write_model(tmp_path / "model", "PINHOLE")
+    write_photographs(tmp_path / "photos")
+    with pytest.raises(WorkspaceError, match="sparse: cannot be written"):
+        export(
+            tmp_path / "model", tmp_path / "new", [form], image_path=tmp_path / "photos"
+        )
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.long
 @pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid(), reason="only root mounts disks"
@@ -217,7 +239,7 @@ def test_pipes_among_the_files_of_a_model_are_refused(
     "limit", ["size=64k", "size=300k", "nr_inodes=4", "nr_inodes=15"]
 )
 @pytest.mark.parametrize(
-    "form", ["ply", "text", "undistorted", "nerfstudio", "cameras"]
+    "form", ["ply", "text", "undistorted", "nerfstudio", "mvsnet", "cameras"]
 )
 def test_small_disks_are_one_line(
     tmp_path: Path, call: Call, limit: str, form: str

@@ -21,6 +21,7 @@ from colmap_affrect.project.match_store import (
     PairMatches,
     pair_key,
 )
+from colmap_affrect.stages.stationary import StationaryFilter
 
 NAMES = ["a.png", "b c.png", "west wing/č ñ 图.jpg", "west wing/upper floor/a.png"]
 
@@ -342,6 +343,66 @@ def test_guided_matches_of_other_images_than_written_are_damage(
         group.attrs["names"] = np.asarray(names, dtype=h5py.string_dtype())
     with pytest.raises(StoreError, match="damaged"):
         store.read()
+
+
+@pytest.mark.parametrize("level", [-1, 2, 1 << 40])
+def test_levels_that_the_recipe_has_not_are_damage(tmp_path: Path, level: int) -> None:
+    names = (NAMES[0], NAMES[1])
+    store = MatchStore(tmp_path / "matches.h5", num_levels=2)
+    store.write([PairMatches(names, np.zeros((0, 2), int), np.zeros(0), 5, level=1)])
+    assert store.levels([names]) == {names: 1}
+    assert store.levels([names], "tried") == {names: 2}
+    with h5py.File(store.path, "r+") as file:
+        file[pair_key(*names)].attrs["level"] = level
+    with pytest.raises(StoreError, match=f"damaged .matches are of level {level}"):
+        store.levels([names])
+    assert MatchStore(store.path).levels([]) == {}
+    begun = Begun(2, (names,))
+    store.update_state(step=begun)
+    with pytest.raises(StoreError, match=r"damaged .matches are of level 2"):
+        _ = store.state
+
+
+@pytest.mark.parametrize("is_in_another_file", [True, False])
+def test_what_is_linked_from_elsewhere_is_not_of_a_store(
+    tmp_path: Path, is_in_another_file: bool
+) -> None:
+    other = FeatureStore(tmp_path / "other.h5")
+    store = FeatureStore(tmp_path / "features.h5")
+    for seed, name in enumerate(("a.png", "b.png", "c.png")):
+        store.write(name, some_features(3, seed), (300, 200))
+    store.path.with_name("other.h5").write_bytes(store.path.read_bytes())
+    with h5py.File(store.path, "r+") as file:
+        for key, source in (("a.png", "/b.png"), ("c.png/lafs", "/b.png/lafs")):
+            del file[key]
+            link = h5py.SoftLink(source)
+            if is_in_another_file:
+                link = h5py.ExternalLink(str(other.path), source)
+            file[key] = link
+    assert store.names() == ["b.png", "c.png"]
+    assert store.lines_of(["a.png"]) == {}
+    with pytest.raises(StoreError, match=r"no features of a\.png"):
+        store.read("a.png")
+    for use in (lambda: store.read("c.png"), store.check_all):
+        with pytest.raises(StoreError, match="is linked from elsewhere"):
+            use()
+    for name in ("a.png", "c.png"):
+        store.write(name, some_features(3), (300, 200))
+    store.check_all()
+
+
+@pytest.mark.parametrize("changes", [
+    {"stationary": (((320, 240), ((1, 2), (99999, 0))),)},
+    {"backgrounds": (("a.png", "zz"),)},
+])  # fmt: skip
+def test_places_that_are_none_are_damage(
+    tmp_path: Path, changes: dict[str, object]
+) -> None:
+    store = MatchStore(tmp_path / "matches.h5")
+    store.update_state(**changes)
+    features = FeatureStore(tmp_path / "features.h5")
+    with pytest.raises(StoreError, match=r"matches\.h5: damaged .*match --output-path"):
+        StationaryFilter(features, store)
 
 
 def test_state_that_is_none_is_damage(matches: MatchStore) -> None:
