@@ -3,6 +3,7 @@
 import copy
 from collections import Counter, defaultdict
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,12 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
-from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS, _ranks
+from colmap_affrect.mappers.thinning import (
+    NUM_MATCHES_OF_PAIR,
+    NUM_TRACKS,
+    _ranks,
+    matches_of_best_tracks,
+)
 
 NUM_IMAGES = 5
 
@@ -62,6 +68,22 @@ def test_tracks_of_most_images_come_first_and_ambiguous_ones_last() -> None:
     num_features = np.array([2, 5, 3, 4, 2])
     num_images = np.array([2, 4, 3, 4, 1])  # the second and the last one are ambiguous
     assert _ranks(num_features, num_images).tolist() == [2, 3, 1, 0, 4]
+
+
+def test_features_say_how_many_tracks_are_left_out_not_matches() -> None:
+    # 600 tracks of six images, of which 500 are kept, make ten times as many matches as 900 of two.
+    long_tracks = np.repeat(np.arange(600)[:, None], 2, axis=1)
+    pairs = [(ids, long_tracks) for ids in combinations(range(6), 2)]
+    for first in (0, 2, 4):
+        short_tracks = np.repeat(np.arange(600, 1500)[:, None], 2, axis=1)
+        ids = first, first + 1
+        index = [pair for pair, _ in pairs].index(ids)
+        pairs[index] = (ids, np.concatenate([long_tracks, short_tracks]))
+    best = matches_of_best_tracks(pairs, dict.fromkeys(range(6), 1500))
+    assert best.share_of_features == pytest.approx(500 / 1500)
+    num_kept = sum(int(is_kept.sum()) for is_kept in best.is_kept)
+    assert num_kept == len(pairs) * NUM_TRACKS
+    assert num_kept > sum(map(len, best.is_kept)) / 2
 
 
 def test_a_thinned_graph_has_its_tracks_whole(path: Path) -> None:
