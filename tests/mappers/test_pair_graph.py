@@ -16,7 +16,9 @@ from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
-from colmap_affrect.mappers import pair_graph
+from colmap_affrect.mappers import pair_graph, sparse
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.incremental import IncrementalMapper
 from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     VerifiedPair,
@@ -25,7 +27,8 @@ from colmap_affrect.mappers.pair_graph import (
     compared_with_pose,
     poses_of,
 )
-from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
+from colmap_affrect.mappers.some_tracks import SOME_TRACKS
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import (
     NUM_MATCHES_OF_PAIR,
     NUM_TRACKS,
@@ -106,6 +109,33 @@ def test_a_model_of_some_tracks_gets_the_points_of_all(
     assert len(model_poses(model.reconstruction)) == NUM_IMAGES
     assert model.reconstruction.num_points3D() > 2000
     assert model.hypotheses[-1] == SOME_TRACKS
+
+
+def test_colmap_maps_a_large_set_from_some_of_the_tracks(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sparse, "MIN_LARGE_SET", NUM_IMAGES)
+    task = task_with_given_cameras(path)
+    num_inliers = []
+    by_colmap = IncrementalMapper.map
+
+    def map_and_count(
+        mapper: IncrementalMapper, task: MappingTask, *others: Any, **named: Any
+    ) -> list[MappedModel]:
+        with open_database(task.database_path) as database:
+            num_inliers.append(database.num_inlier_matches())
+        return by_colmap(mapper, task, *others, **named)
+
+    monkeypatch.setattr(IncrementalMapper, "map", map_and_count)
+    (model,) = SparseMapper(SparseOptions()).map(task, tmp_path, 0, lambda _: None)
+    assert model.hypotheses == (SOME_TRACKS,)
+    thin = PairGraph.read(path).thinned()
+    assert num_inliers == [sum(len(pair.matches) for pair in thin.verified)]
+    assert list(tmp_path.glob("**/*.db")) == []
+    num_thin = len(set().union(*features_of_pairs(thin).values()))
+    assert len(model_poses(model.reconstruction)) == NUM_IMAGES
+    assert model.reconstruction.num_points3D() > 2000 > num_thin
+    assert model.add_last_points is not None
 
 
 def test_pairs_leave_a_graph_and_what_the_mappers_see(path: Path) -> None:
