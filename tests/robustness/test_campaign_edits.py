@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 from campaign import CAMPAIGN, TIMES, assert_clear, run_words
 from command import Call
@@ -176,3 +177,61 @@ def test_edited_record_makes_nothing_surer(
         assert said_of(out) == said_of(scene / "out"), end
     for file in ("features.h5", "matches.h5"):
         assert (out / file).read_bytes() == (scene / "out" / file).read_bytes()
+
+
+STORES = ("features.h5", "matches.h5", "guided.h5")
+ODD_ATTRIBUTES = (
+    -1, 1, 7, 1 << 40, 0.5, float("nan"), "x", b"\xff", [1, 2], ["b.png", "a.png"], True,
+    '{"step": {"level": 7, "pairs": [["a.png", "z.png"]]}}',
+    '{"stationary": [[[320, 240], [[99999, -5]]]]}', '{"backgrounds": [["a.png", "zz"]]}',
+)  # fmt: skip
+
+
+def odd_attribute(file: h5py.File, chance: random.Random) -> str:
+    """Change, add or remove an attribute of an entry, or of the file."""
+    entries: list[Any] = [file]
+    file.visititems(lambda _, item: entries.append(item) if len(item.attrs) else None)
+    entry = chance.choice(entries)
+    name = chance.choice([*entry.attrs, "level"])
+    value = chance.choice(ODD_ATTRIBUTES)
+    if chance.random() < 0.2 and name in entry.attrs:
+        del entry.attrs[name]
+    else:
+        entry.attrs[name] = value
+    return f"{entry.name} {name}={value!r}"
+
+
+def odd_link(file: h5py.File, chance: random.Random) -> str:
+    """Have an entry or its values linked from elsewhere."""
+    keys: list[str] = []
+    file.visit(keys.append)
+    key, source = chance.sample(keys, 2)
+    link = chance.choice((
+        h5py.SoftLink(f"/{source}"), h5py.SoftLink("/nowhere"), h5py.SoftLink(f"/{key}"),
+        h5py.ExternalLink(file.filename, f"/{source}"), h5py.ExternalLink("none.h5", "/x"),
+    ))  # fmt: skip
+    del file[key]
+    file[key] = link
+    return f"{key} -> {link.path}"
+
+
+@pytest.mark.parametrize("number", range(16 * TIMES))
+def test_edited_store_makes_nothing_surer(
+    scene: Path, tmp_path: Path, call: Call, number: int
+) -> None:
+    chance = random.Random(f"store {number}")
+    out = Path(shutil.copytree(scene / "out", tmp_path / "out"))
+    path = out / chance.choice(STORES)
+    edit = (odd_attribute, odd_link)[number % 2]
+    with h5py.File(path, "r+") as file:
+        what = edit(file, chance)
+    sys.stdout.write(f"{path.name}: {what}\n")  # shown when the test fails
+    assert call("doctor", "-q", out).code in (0, 1)
+    end = call(*run_words(scene, out), "--no-page")
+    assert_clear(end, 0, 1, 2)
+    if not end.code:
+        before, after = said_of(scene / "out"), said_of(out)
+        for name, probability in after["probabilities"].items():
+            assert probability <= before["probabilities"][name] + 0.05
+    for words in (["verify", "--overwrite"], ["map", "--no-page"]):
+        assert_clear(call(*words, "-q", "--output-path", out), 0, 1, 2, 3)
