@@ -23,7 +23,7 @@ from colmap_affrect.images.photographs import (
     photograph_files,
     require_folder,
 )
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, PNG, pages
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, JPEG, PNG, pages
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.atomic_files import cannot_write
@@ -37,7 +37,6 @@ from colmap_affrect.project.outputs import LONGEST_NAME, fitting_name, new_resul
 from colmap_affrect.project.paths import PathLike, as_path
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
-JPEG = b"\xff\xd8"
 OF_PHOTOGRAPHS = (
     "AVIF", "BMP", "GIF", "HEIF", "JPEG", "JPEG2000", "JXL", "PNG", "PPM", "PSD", "TGA", "TIFF",
     "WEBP",

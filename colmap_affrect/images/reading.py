@@ -24,6 +24,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from colmap_affrect.data import ColorImage, GrayImage, Mask
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.images.few_reads import FewReads
 from colmap_affrect.images.pnm import (
     MAX_HEADER,
     pnm_header,
@@ -52,10 +53,11 @@ files are compared with their pixels."""
 MAX_BYTES_PER_PX = 16  # four channels of four bytes; format
 # Filters of warnings are of the process: threads would mix them up
 ONE_AT_A_TIME = Lock()
+JPEG = b"\xff\xd8"
 PNG = b"\x89PNG\r\n\x1a\n"
 PNM = b"P"
 READERS = {
-    b"\xff\xd8": jpeg_factory,
+    JPEG: jpeg_factory,
     PNG: PngImageFile,
     b"II": TiffImageFile,
     b"MM": TiffImageFile,
@@ -83,11 +85,14 @@ def open_image(file: BinaryIO) -> Image.Image:
     """Open an image by its header; what is damaged raises nearly anything."""
     start = file.read(len(PNG))
     file.seek(0)
+    source: Any = file
     if start.startswith(PNM):  # whose header Pillow reads byte by byte
-        file = io.BytesIO(file.read(MAX_HEADER))
+        source = io.BytesIO(file.read(MAX_HEADER))
+    if start.startswith((JPEG, PNG)):
+        source = FewReads(file)
     for magic, reader in READERS.items():
         if start.startswith(magic):
-            return reader(file, "")
+            return reader(source, "")
     raise ValueError(NO_IMAGE)
 
 

@@ -23,6 +23,7 @@ from synthetic import blobs, centroid, png_of_size, write_image
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.conventions import resized_from_original
+from colmap_affrect.images import reading
 from colmap_affrect.images.pnm import pnm_header
 from colmap_affrect.images.reading import (
     IMAGE_SUFFIXES,
@@ -163,6 +164,24 @@ def test_floats_of_any_range_are_seen(tmp_path: Path, low: float, high: float) -
 @pytest.mark.skipif(
     not Path("/proc/self/mem").exists(), reason="only Linux has such a file"
 )
+@pytest.mark.parametrize("rest", [b"\xff" * 4_000_000, b"\xff\x00" * 2_000_000])
+def test_header_of_nothing_but_fill_is_no_header_at_once(
+    tmp_path: Path, rest: bytes
+) -> None:
+    """Pillow reads such a JPEG byte by byte, in Python."""
+    path = tmp_path / "x.jpg"
+    path.write_bytes(b"\xff\xd8" + rest)
+    start = time.process_time()
+    assert header_size(path) is None
+    assert time.process_time() - start < 0.7  # it took 3 seconds and more
+
+
+def test_photograph_of_thousands_of_parts_is_read(tmp_path: Path) -> None:
+    pages = [PIL.Image.fromarray(np.zeros((8, 8), np.uint8))] * 400
+    pages[0].save(tmp_path / "x.tif", save_all=True, append_images=pages[1:])
+    assert len(reading.pages(tmp_path / "x.tif")) == 400
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_floats_that_are_no_numbers_are_read_without_a_warning(value: float) -> None:
     image = np.full((40, 60), value, np.float32)
