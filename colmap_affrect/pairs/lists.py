@@ -25,6 +25,7 @@ Pair = tuple[str, str]  # names of two photographs, in order
 # At the end of a line; in the time of its length, however many blanks or digits it has.
 SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
 # Words of a line for which names that are like them are looked for; display
+MAX_PROBLEMS = 1000  # lines that are none, after which no more are looked for; resource
 MAX_SUGGESTIONS = 8
 # Characters: systems have no longer paths than half of it; format
 LONGEST_LINE = 1 << 13
@@ -256,7 +257,8 @@ def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Ind
     if problems:
         (line_number, line) = problems[0]
         more = len(problems) - 1
-        others = f", nor are {more} more lines" if more else ""
+        least = "at least " if more == MAX_PROBLEMS else ""
+        others = f", nor are {least}{more} more lines" if more else ""
         raise OptionError(
             f"line {line_number}: {clipped(repr(line), MAX_SHOWN)} is not two names "
             f"of images{_suggestion(line, names)}{others}",
@@ -297,7 +299,10 @@ def _codes(
     number and text of lines that are no pair.
     """
     number = {name: index for index, name in enumerate(names)}
+    may_begin_so = any(text.lstrip().startswith("#") for text in (*names, *folders))
     for line_number, line in enumerate(lines, start=1):
+        if line.lstrip().startswith("#") and not may_begin_so:
+            continue
         pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
         pair = pair or _split_of_others(line, number, folders)
         if pair:
@@ -306,6 +311,8 @@ def _codes(
                 yield low * len(names) + high
         elif line.strip() and not line.lstrip().startswith("#"):
             problems.append((line_number, line.strip()))
+            if len(problems) > MAX_PROBLEMS:
+                return
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:

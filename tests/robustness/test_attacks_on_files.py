@@ -205,6 +205,20 @@ def test_comment_of_any_length_hides_no_pair(tmp_path: Path) -> None:
     assert list(pairs) == [("a.png", "b.png"), ("b.png", "c.png")]
 
 
+def test_many_lines_that_are_no_pairs_are_gone_over_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_text("# a comment\n" * 100_000 + "a.png b.png\n")
+    start = time.process_time()
+    assert list(read_pairs(path, ["a.png", "b.png"], tmp_path)) == [("a.png", "b.png")]
+    path.write_text("x.png y.png\n" * 100_000)
+    said = "is not two names of images.*, nor are at least 1000 more lines"
+    with pytest.raises(AffrectError, match=said):
+        read_pairs(path, ["a.png", "b.png"], tmp_path)
+    assert time.process_time() - start < 1.0  # either took 3 seconds and more
+    path.write_text("#a.png b.png\n# c\n")
+    assert list(read_pairs(path, ["#a.png", "b.png"])) == [("#a.png", "b.png")]
+
+
 def test_list_without_line_ends_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     with path.open("wb") as file:
