@@ -7,9 +7,8 @@ from typing import BinaryIO
 from colmap_affrect.project.image_failures import NO_IMAGE
 
 USUAL_READS = 10_000  # of a file, beside those that its length lets expect; damage
-BYTES_PER_READ = (
-    8  # of markers of JPEG and chunks of PNG, on average over a long file; damage
-)
+# Of markers of JPEG and chunks of PNG, on average over a long file; damage
+BYTES_PER_READ = 8
 
 
 class FewReads(io.BufferedIOBase):

@@ -25,7 +25,8 @@ Pair = tuple[str, str]  # names of two photographs, in order
 # At the end of a line; in the time of its length, however many blanks or digits it has.
 SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
 # Words of a line for which names that are like them are looked for; display
-MAX_PROBLEMS = 1000  # lines that are none, after which no more are looked for; resource
+# Lines that are none, after which no more are looked for; resource
+MAX_PROBLEMS = 1000
 MAX_SUGGESTIONS = 8
 # Characters: systems have no longer paths than half of it; format
 LONGEST_LINE = 1 << 13
