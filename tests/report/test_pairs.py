@@ -30,7 +30,13 @@ from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
-from colmap_affrect.report.pair_lines import MAX_NUM_PAIRS, num_lines_of_pair
+from colmap_affrect.report.pair_lines import (
+    MAX_NUM_PAIRS,
+    MAX_NUM_PAIRS_IN_FILES,
+    MIN_NUM_LINES_OF_PAIR,
+    NUM_PAIRS_OF_FILE,
+    num_lines_of_pair,
+)
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
@@ -338,3 +344,10 @@ def test_a_page_draws_each_pair_and_fewer_lines_of_each_where_there_are_many() -
     assert num_lines_of_pair(780) == 30
     assert num_lines_of_pair(MAX_NUM_PAIRS) == 20
     assert MAX_NUM_PAIRS >= 100 * 99 / 2
+
+
+def test_files_beside_the_page_are_small_and_all_of_them_can_be_kept() -> None:
+    """A pair is twenty lines of nine bytes, as base64, and a text of 100 letters."""
+    num_bytes = 4 / 3 * 9 * MIN_NUM_LINES_OF_PAIR + 100
+    assert 1e6 < num_bytes * NUM_PAIRS_OF_FILE < 3e6
+    assert 20e6 < num_bytes * MAX_NUM_PAIRS_IN_FILES < 50e6

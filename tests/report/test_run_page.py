@@ -20,6 +20,7 @@ from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import Advice
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures
+from colmap_affrect.report.pair_lines import PairFile
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
 from colmap_affrect.session.view_graph import ViewGraph
 
@@ -79,6 +80,15 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
     assert markup.unescape(policy) == (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
     )
+
+
+def test_only_a_page_with_files_beside_it_may_load_scripts(
+    html: str, tmp_path: Path
+) -> None:
+    assert "'self'" not in html
+    content = RunContent(NAMES, {}, pair_files=[PairFile("report.pairs-1.js", (0, 1))])
+    page = write_run_page(Workspace(tmp_path), small_report(tmp_path), content)
+    assert "script-src 'self' file: 'sha256-" in page.read_text(encoding="utf-8")
 
 
 def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:
