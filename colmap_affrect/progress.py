@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TextIO
 
 from tqdm import tqdm
@@ -29,6 +29,7 @@ class Voice:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.doing = "beginning"
         self.is_listened_to = False  # something speaks where nothing else does
+        self.forecast: Forecast | None = None  # of the run that is at work
         self._clock = clock
         self._heard_s = clock()  # when something was shown last
         self._since_s = (
@@ -57,7 +58,9 @@ class Voice:
         if stays:
             silent_s = now_s - self._since_s
             self._quiet_s = min(max(QUIET_S, silent_s), LONGEST_QUIET_S)
-        return f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
+        text = f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
+        left = self.forecast.text() if self.forecast else ""
+        return f"{text}, {left}" if left else text
 
 
 @dataclass(eq=False)
@@ -95,6 +98,11 @@ class Progress:
         shown = cls(sys.stderr)
         is_wanted = shown.takes_bars if progress is None else progress
         return shown if is_wanted else SILENT
+
+    def with_forecast(self, forecast: Forecast) -> "Progress":
+        """Return the same progress that says how long all stages still take."""
+        self.voice.forecast = forecast
+        return replace(self, forecast=forecast)
 
     @property
     def takes_bars(self) -> bool:

@@ -113,7 +113,7 @@ def make_run_page(folder: Path) -> Path:
     pair = PairPicture(
         names=NAMES[:2],
         why=f"{NAMES[0]} is doubtful; guided",
-        text="120 raw matches of level 0 (dense-shapes), 60 inliers",
+        text="120 matches by dense-shapes, 60 inliers",
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )

@@ -124,7 +124,7 @@ def _run(
     usable = options.resources.usable_levels(recipe.extraction)
     megapixels = _megapixels(names, image_path, recipe.extraction.max_image_size_px)
     forecast = forecast_of(recipe.levels, usable, len(names), num_pairs, megapixels)
-    context = replace(context, progress=replace(context.progress, forecast=forecast))
+    context = replace(context, progress=context.progress.with_forecast(forecast))
     _prepare_parts(context, recipe)
     later = options.later_stages()
     if overwrite or not workspace.features.exists():

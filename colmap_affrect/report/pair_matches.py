@@ -167,14 +167,14 @@ class PairReader:
         return [np.array(points[0]).reshape(-1, 2), np.array(points[1]).reshape(-1, 2)]
 
     def _text(self, names: Pair, num_raw: int, num_inliers: int) -> str:
-        """Return how many matches a pair has, of which level, and what the model says."""
-        text = f"{num_raw} raw matches"
+        """Return how many matches a pair has, how they came, and what the model says."""
+        text = f"{num_raw} matches"
         if self.run:
             pair = (min(names), max(names))
             # Another program has matched the pair, and not the run
             with suppress(StoreError):
                 level = self.run.matches.levels([pair])[pair]
-                text += f" of level {level} ({self.run.extraction.levels[level].name})"
+                text += f" by {self.run.extraction.levels[level].name}"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))
         if share is not None:

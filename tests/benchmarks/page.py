@@ -46,7 +46,7 @@ NUM_NEIGHBOURS = 40  # photographs that each one is verified with
 NUM_OPENINGS = 3
 WIDTH = 1400
 NUM_INLIERS = 60  # of a pair
-TEXT = "60 raw matches of level 0 (dense-shapes), 60 inliers, 97% of them agree with the model"
+TEXT = "60 matches by dense-shapes, 60 inliers, 97% of them agree with the model"
 HEADER = (
     "page",
     "MB",

@@ -204,8 +204,7 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(
     np.testing.assert_allclose([places[-1] for places in pair.points], marks)
     count = len(inliers)
     assert pair.text == (
-        f"{count} raw matches of level 1 (second), {count} inliers, 100% of them agree with the "
-        "model"
+        f"{count} matches by second, {count} inliers, 100% of them agree with the model"
     )
 
 
@@ -249,7 +248,7 @@ def test_a_pair_without_any_match_is_drawn_too(scene: Path, tmp_path: Path) -> N
     said = pairs.draw_pair(
         path, NAMES[:2], tmp_path / "photographs", tmp_path / "pair.png"
     )
-    assert said == f"a.png and b.png: 0 raw matches, 0 inliers\n{tmp_path / 'pair.png'}"
+    assert said == f"a.png and b.png: 0 matches, 0 inliers\n{tmp_path / 'pair.png'}"
 
 
 def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
