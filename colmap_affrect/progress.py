@@ -37,10 +37,15 @@ class Voice:
         )  # when what is done last showed something of its own
         self._quiet_s = QUIET_S
 
-    def heard(self, doing: str) -> None:
-        """Something was shown."""
+    def heard(self, doing: str, ago_s: float = 0.0) -> None:
+        """Something was shown, or a person began to wait.
+
+        Args:
+            doing: what is done.
+            ago_s: seconds since then.
+        """
         self.doing = doing
-        self._heard_s = self._clock()
+        self._heard_s = self._clock() - ago_s
         self._since_s = self._heard_s
         self._quiet_s = QUIET_S
 
@@ -203,13 +208,14 @@ class Progress:
 
     @contextmanager
     def never_silent(
-        self, doing: str = "beginning", interval_s: float = 1.0
+        self, doing: str = "beginning", interval_s: float = 1.0, waited_s: float = 0.0
     ) -> Iterator[None]:
         """Say that the work goes on, for as long as the context lasts and nothing else speaks.
 
         Args:
             doing: what is done, until a stage begins; inside of another such context that one's.
             interval_s: how often to see whether something was said, seconds.
+            waited_s: how long a person has waited already.
         """
         stream = self.stream
         voice = self.voice
@@ -218,7 +224,7 @@ class Progress:
             return
         is_over = threading.Event()
         replaces = self.takes_bars
-        voice.heard(f"{self.title}{doing}")
+        voice.heard(f"{self.title}{doing}", waited_s)
         voice.is_listened_to = True
 
         def listen() -> None:

@@ -275,6 +275,17 @@ def test_a_voice_speaks_after_four_seconds_and_seldomer_where_lines_stay() -> No
     assert voice.wanted(stays=True) == "pictures: at work for 4 s"
 
 
+def test_a_voice_counts_what_a_person_has_waited_before() -> None:
+    clock = Clock()
+    clock.now_s = 10.0
+    voice = Voice(clock)
+    voice.heard("inspect", ago_s=2.5)
+    clock.now_s += 1.0
+    assert voice.wanted(stays=True) == ""
+    clock.now_s += 1.0
+    assert voice.wanted(stays=True) == "inspect: at work for 4 s"
+
+
 def test_a_voice_counts_seconds_where_a_line_is_replaced() -> None:
     now_s = 0.0
     voice = Voice(clock=lambda: now_s)
