@@ -47,6 +47,7 @@ class Forecast:
         goes_on: bool = True,
         megapixels: float = 0.0,
         num_cores: int = 1,
+        is_new: bool = True,
     ) -> None:
         """Take what is ahead if all images are new.
 
@@ -59,6 +60,8 @@ class Forecast:
             megapixels: of all photographs at the size of processing, by which a run is forecast
                 until something is measured; 0: it is not.
             num_cores: that work at once.
+            is_new: whether nothing of the run is there already: else the first stage tells how
+                much is left.
         """
         self._expected_unit_s = 0.0  # of a unit of cost, until something is measured
         if num_images:
@@ -66,6 +69,7 @@ class Forecast:
             self._expected_unit_s = core_s / num_images / max(1, num_cores)
         self._num_cores = max(1, num_cores)
         self._goes_on = goes_on
+        self._is_new = is_new
         self._learned_cost = 0.0
         if num_learned_pairs:
             self._learned_cost = LEARNED_COSTS["image"] * num_images
@@ -196,7 +200,7 @@ class Forecast:
 
     def _left_of_loading_s(self, now_s: float) -> float | None:
         """Return how long it takes until the first stage begins; None where nobody knows."""
-        if not self._expected_unit_s:
+        if not self._expected_unit_s or not self._is_new:
             return None
         return max(0.0, LOADING_CORE_S - (now_s - self._run_began_s))
 

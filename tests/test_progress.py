@@ -158,6 +158,14 @@ def test_a_run_of_unknown_photographs_is_forecast_when_it_has_lasted_a_while() -
     assert forecast.left_s() is not None
 
 
+def test_a_run_that_goes_on_is_forecast_when_it_is_known_what_is_left() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 0, clock, goes_on=False, megapixels=20.0, is_new=False)
+    assert forecast.left_s() is None
+    forecast.begin("extract", 1)
+    assert forecast.left_s() is not None
+
+
 def test_what_is_at_work_says_how_long_the_run_still_takes() -> None:
     clock = Clock()
     voice = Voice(clock)
