@@ -260,7 +260,7 @@ def test_pairs_that_are_not_in_the_page_are_read_from_files_beside_it(
     for one in range(6):
         for two in range(one):
             texts.append(read_of_pair(running, one, two))
-    drawn = [text for text in texts if text.endswith("of them are drawn.")]
+    drawn = [text for text in texts if "of them are drawn" in text]
     assert len(drawn) == 10
     assert texts.count(LEFT_OUT) == 5
     assert sorted(running.run(loaded)) == ["report.pairs-1.js", "report.pairs-2.js"]

@@ -160,9 +160,9 @@
 
   function textOf(one, two) {
     const lines = known.get(`${one} ${two}`);
-    if (lines) return `${lines.text}; ${lines.count} of them are drawn.`;
+    if (lines) return `${lines.text}; ${lines.count} of them are drawn. Where they are wrong, run again with:`;
     const isComplete = !data.num_pairs_left_out || countOf(one, two) === 0;
-    return isComplete ? "They share no verified match." : "They share matches that this page leaves out; the command below draws them.";
+    return isComplete ? "They share no verified match. What was rejected, if anything, is drawn by:" : "They share matches that this page leaves out; the command below draws them.";
   }
 
   async function showPair(one, two) {
