@@ -16,7 +16,7 @@ MAP_CORE_S = 0.3
 CORE_S_PER_MEGAPIXEL = 1.5
 """Of ``extract``, at the size of processing; measured there: 1.2 to 1.8 on five sets."""
 LEARNED_COSTS = {"image": 1.25, "pair": 2.15}
-"""Of learned matching, in the same unit: measured there, 0.7 to 1.3 times that on two sets."""
+"""Of learned matching, in the same unit: measured there, 0.5 to 1.7 times that on four sets."""
 AFTER_FIRST_MODEL = ("escalate", "pictures")
 """Stages that follow the first model."""
 AFTER_SHARE = 1.0
@@ -26,7 +26,7 @@ of both, only it can tell."""
 FACTOR = 2.0  # that a forecast may be off; where it may be more, two are told; display
 GOES_ON_SHARE = 0.5
 """Of the time that mapping took already: hypotheses after the last image; measured there."""
-LIKELY_SHARE = 0.5  # of the time that all steps may take at most: most help; measured
+LIKELY_SHARE = 0.5  # of the time that all steps may still take: most help; measured
 # Of a run of whose photographs nothing is known: before, it says too little; display
 MIN_ELAPSED_S = 3.0
 # Units after the first ones that tell how fast a stage is; display
@@ -178,11 +178,10 @@ class Forecast:
         if here_s is None and not self._limit_s:
             return None
         known_s = here_s or 0.0
-        likely_s = LIKELY_SHARE * self._limit_s
         if self._is_learned_matching:
-            return known_s, known_s + likely_s
+            return known_s, known_s + LIKELY_SHARE * self._limit_s
         passed_s = now_s - self._limit_told_s
-        left_s = max(known_s, likely_s - passed_s)
+        left_s = max(known_s, LIKELY_SHARE * (self._limit_s - passed_s))
         return left_s, left_s
 
     def _left_of_stage_s(self, now_s: float) -> float | None:
