@@ -24,9 +24,9 @@ Pair = tuple[str, str]  # names of two photographs, in order
 
 # At the end of a line; in the time of its length, however many blanks or digits it has.
 SCORE = re.compile(r"(?<![\s,])[\s,]+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?$")
-# Words of a line for which names that are like them are looked for; display
 # Lines that are none, after which no more are looked for; resource
 MAX_PROBLEMS = 1000
+# Words of a line for which names that are like them are looked for; display
 MAX_SUGGESTIONS = 8
 # Characters: systems have no longer paths than half of it; format
 LONGEST_LINE = 1 << 13
@@ -300,10 +300,7 @@ def _codes(
     number and text of lines that are no pair.
     """
     number = {name: index for index, name in enumerate(names)}
-    may_begin_so = any(text.lstrip().startswith("#") for text in (*names, *folders))
-    for line_number, line in enumerate(lines, start=1):
-        if line.lstrip().startswith("#") and not may_begin_so:
-            continue
+    for line_number, line in _without_comments(lines, [*names, *folders]):
         pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
         pair = pair or _split_of_others(line, number, folders)
         if pair:
@@ -314,6 +311,16 @@ def _codes(
             problems.append((line_number, line.strip()))
             if len(problems) > MAX_PROBLEMS:
                 return
+
+
+def _without_comments(
+    lines: Iterable[str], beginnings: Iterable[str]
+) -> Iterator[tuple[int, str]]:
+    """Yield lines with their numbers, those with # only if one of some texts begins so, too."""
+    are_told_apart = not any(text.lstrip().startswith("#") for text in beginnings)
+    for line_number, line in enumerate(lines, start=1):
+        if not (are_told_apart and line.lstrip().startswith("#")):
+            yield line_number, line
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:

@@ -93,7 +93,12 @@ class RunReport(ReconstructionReport):
         with_warnings: bool = True,
         said: Callable[[Words], str] = with_arguments,
     ) -> str:
-        """Return one screen of text; see :meth:`ReconstructionReport.summary`."""
+        """Return one screen of text.
+
+        Args:
+            with_warnings: whether it has what stages warned of, which they have logged.
+            said: what options are called: :func:`with_arguments`, or :func:`with_flags`.
+        """
         lines = [super().summary(with_warnings=with_warnings, said=said)]
         for one in self.focal_contradictions[:MAX_LINES]:
             lines.append(f"lines       {said(contradiction_words(one))}")
