@@ -73,7 +73,12 @@ class _Reader:
         return struct.unpack(layout, self.file.read(struct.calcsize(layout)))
 
     def rows(self, count: int, layout: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
-        """Yield all rows of an array, some at a time."""
+        """Yield the rows of an array, some at a time.
+
+        Args:
+            count: number of them all.
+            layout: of one.
+        """
         start = self.skip(layout.itemsize * count)
         self.file.seek(start)
         for first in range(0, count, ROWS_AT_ONCE):
