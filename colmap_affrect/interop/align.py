@@ -293,7 +293,7 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
         )
     before = np.array([old[name] for name in names])
     after = np.array([true[name] for name in names])
-    origin = tuple(after.mean(axis=0).tolist()) if is_on_earth else ()
+    origin = _middle_on_earth(after) if is_on_earth else ()
     if origin:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *origin))
     for points in (before, after):
@@ -319,6 +319,18 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
         residuals=dict(zip(names, residuals, strict=True)),
         origin=origin,
     )
+
+
+def _middle_on_earth(positions: Array) -> tuple[float, ...]:
+    """Return latitude, longitude and altitude amid (N, 3) positions.
+
+    Longitudes have no mean across 180 degrees or at a pole, places in space have one. That is below
+    the ground where positions are far apart, so that its altitude does not count.
+    """
+    in_space = np.asarray(WGS84.ellipsoid_to_ecef(positions)).mean(axis=0)
+    latitude, longitude, _ = np.asarray(WGS84.ecef_to_ellipsoid(in_space[None]))[0]
+    altitude = positions[:, 2].mean()
+    return float(latitude), float(longitude), float(altitude)
 
 
 def _scale(places: Places, distances: Sequence[tuple[str, str, float]]) -> _Fit:
@@ -357,7 +369,7 @@ def _gps(path: Path) -> tuple[Places, bool]:
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
         raise DatabaseError(
-            "no photograph has a position",
+            "no photograph has a position (latitude, longitude and altitude)",
             where=path,
             advice=("give ", Option("positions"), " FILE"),
         )

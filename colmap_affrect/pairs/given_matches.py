@@ -6,7 +6,8 @@
 - deep-image-matching, and notebooks of the image matching challenge: a group for the first image,
   in it for the second one the (M, 2) matches.
 - COLMAP's text lists, as ``matches_importer`` takes them: a line of two names, a line of two
-  numbers for each match, and an empty line.
+  numbers for each match, and an empty line. Names may be paths into the folder of the photographs,
+  also with backslashes, as in lists of pairs.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,9 +18,20 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError, StoreError, damage, such_as
+from colmap_affrect.errors import (
+    OptionError,
+    StoreError,
+    damage,
+    not_utf_8,
+    such_as,
+)
 from colmap_affrect.geometry.arrays import Indices
-from colmap_affrect.pairs.lists import Pair, split_line
+from colmap_affrect.pairs.lists import (
+    Pair,
+    spellings,
+    split_line,
+    split_of_others,
+)
 from colmap_affrect.project.given_h5 import GivenFile, open_given_file
 from colmap_affrect.project.regular_files import read_regular_text
 
@@ -43,15 +55,19 @@ class GivenMatches:
 
 
 @contextmanager
-def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
+def given_matches(
+    path: Path, names: Collection[str], image_path: Path | None = None
+) -> Iterator[GivenMatches]:
     """Open a file of matches of named images.
 
     Args:
         path: HDF5 file, or text.
         names: of the images that have features.
+        image_path: folder of the photographs, into which paths in text may lead; None: they are
+            refused.
 
     Raises:
-        OptionError: when there is no such file.
+        OptionError: when there is no such file, or it is text in another encoding than UTF-8.
         StoreError: when it is damaged, or names other images.
     """
     if not path.is_file():
@@ -59,7 +75,8 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
     with path.open("rb") as file:
         has_signature = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
     if not has_signature and path.suffix != ".h5":
-        yield _read_list(path, names)
+        folders = spellings(image_path) if image_path else ()
+        yield _read_list(path, names, folders)
         return
     with open_given_file(path) as source:
         yield _of_hdf5(source, names)
@@ -175,19 +192,27 @@ def _refuse_unknown(path: Path, keys: Collection[str]) -> None:
         )
 
 
-def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
-    """Read a text list of COLMAP."""
+def _read_list(
+    path: Path, names: Collection[str], folders: Sequence[str]
+) -> GivenMatches:
+    """Read a text list of COLMAP.
+
+    Args:
+        path: the list.
+        names: of the images that have features.
+        folders: how paths into the folder of the photographs begin.
+    """
     known = set(names)
     found: dict[Pair, Indices] = {}
     with damage(path, COMPLETE):
-        lines = read_regular_text(path, "utf-8-sig").splitlines()
+        lines = _lines(path)
         number = 0
         while number < len(lines):
             line = lines[number].strip()
             number += 1
             if not line or line.startswith("#"):
                 continue
-            pair = split_line(line, known)
+            pair = split_line(line, known) or split_of_others(line, known, folders)
             if not pair:
                 raise StoreError(
                     f"line {number}: {line!r} is not two names of images that have "
@@ -209,6 +234,13 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
     return GivenMatches(
         path=path, pairs=tuple(found), read=lambda _: iter(found.items())
     )
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_regular_text(path, "utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise not_utf_8(path) from error
 
 
 def _end_of_matches(lines: Sequence[str], begin: int) -> int:

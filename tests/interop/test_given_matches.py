@@ -120,6 +120,31 @@ def test_lists_of_matches_importer_are_read(files: Files, match_type: str) -> No
         assert geometry.config == pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
 
 
+@pytest.mark.parametrize("line", [
+    "{folder}/a.png {folder}/sub/b c.png", "{folder}\\a.png {folder}\\sub\\b c.png",
+    ".\\a.png .\\sub\\b c.png", "photos/a.png\tphotos/sub/b c.png", "a.png,sub/b c.png,0.93",
+])  # fmt: skip
+def test_lists_of_matches_may_name_paths_into_the_folder_as_lists_of_pairs(
+    files: Files, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    monkeypatch.chdir(files.photos.parent)
+    files.matches = files.folder / "matches.txt"
+    named = line.format(folder=files.photos)
+    files.matches.write_bytes(f"{named}\r\n0 3\r\n2 1\r\n\r\n".encode())
+    files.import_all()
+    assert files.pairs() == {PAIR: [[0, 3], [2, 1]]}
+
+
+def test_lists_of_matches_in_another_encoding_are_refused_with_advice(
+    files: Files,
+) -> None:
+    files.matches = files.folder / "matches.txt"
+    files.matches.write_text(LIST, encoding="utf-16")
+    with pytest.raises(OptionError, match=r"no text in UTF-8; save it as UTF-8"):
+        files.import_all()
+    assert not files.database.exists()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [("a.png gone.png\n0 0\n", r"line 1: 'a.png gone.png' is not two names of images"),
