@@ -10,10 +10,11 @@
   also with backslashes, as in lists of pairs.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
@@ -133,7 +134,9 @@ def _hloc_pairs(
     source: GivenFile, names: Collection[str]
 ) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file of hloc with their keys."""
-    by_key = {name.replace("/", "-"): name for name in names}
+    by_key: dict[str, str] = {}
+    for written, name in _as_written(names).items():
+        by_key[written.replace("/", "-")] = name
     unknown = []
     for key in source.groups_with(HLOC):
         found = list(_splits(key, "/", by_key)) or list(_splits(key, "_", by_key))
@@ -156,9 +159,7 @@ def _nested_pairs(
     source: GivenFile, names: Collection[str]
 ) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file with a group for each first image."""
-    by_key = {name: name for name in names}
-    for name in names:
-        by_key.setdefault(Path(name).name, name)
+    by_key = _as_written(names)
     unknown = []
     has_matches = False
     for key, shape in sorted(source.shapes.items()):
@@ -173,6 +174,18 @@ def _nested_pairs(
     if not has_matches:
         source.groups_with(HLOC)  # which says what is missing
     _refuse_unknown(source.path, unknown)
+
+
+def _as_written(names: Collection[str]) -> dict[str, str]:
+    """Return images by their names, and without folders where only one image is called so."""
+    count = Counter(PurePosixPath(name).name for name in names)
+    images: dict[str, str] = {}
+    for name in names:
+        without_folder = PurePosixPath(name).name
+        if count[without_folder] == 1:
+            images[without_folder] = name
+        images[name] = name
+    return images
 
 
 def _splits(key: str, separator: str, by_key: Mapping[str, str]) -> Iterator[Pair]:
@@ -202,7 +215,7 @@ def _read_list(
         names: of the images that have features.
         folders: how paths into the folder of the photographs begin.
     """
-    known = set(names)
+    known = _as_written(names)
     found: dict[Pair, Indices] = {}
     with damage(path, COMPLETE):
         lines = _lines(path)
@@ -212,13 +225,14 @@ def _read_list(
             number += 1
             if not line or line.startswith("#"):
                 continue
-            pair = split_line(line, known) or split_of_others(line, known, folders)
-            if not pair:
+            written = split_line(line, known) or split_of_others(line, known, folders)
+            if not written:
                 raise StoreError(
                     f"line {number}: {line!r} is not two names of images that have "
                     "features, nor two numbers of features",
                     where=path,
                 )
+            pair = (known[written[0]], known[written[1]])
             end = _end_of_matches(lines, number)
             is_known = pair in found or pair[::-1] in found
             if pair[0] != pair[1] and not is_known:

@@ -86,6 +86,40 @@ def test_files_of_deep_image_matching_are_read(files: Files) -> None:
     assert files.pairs() == {PAIR: [[0, 3], [2, 1]]}
 
 
+def two_folders(tmp_path: Path, names: list[str]) -> Path:
+    """Write photographs and features of these names; return where matches go."""
+    write_photos(tmp_path / "photos", names)
+    write_h5(tmp_path / "f.h5", {name: hloc_group(3) for name in names})
+    return tmp_path / "matches"
+
+
+def import_two_folders(tmp_path: Path, matches: Path) -> int:
+    paths = (tmp_path / "photos", tmp_path / "f.h5", matches, tmp_path / "new.db")
+    return import_h5(*paths, skip_verification=True).num_pairs
+
+
+@pytest.mark.parametrize("kind", ["hloc", "hloc, older", "deep-image-matching", "list"])
+def test_names_without_folders_are_read_where_one_image_is_called_so(
+    tmp_path: Path, kind: str
+) -> None:
+    def write(path: Path) -> None:
+        if kind == "list":
+            path.write_text("x.png y.png\n0 2\n", encoding="utf-8")
+            return
+        nested = {"x.png": {"y.png": np.array([[0, 2]])}}
+        separator = "_" if "older" in kind else "/"
+        flat = {f"x.png{separator}y.png": match_group([2, -1, -1])}
+        write_h5(path, nested if kind == "deep-image-matching" else flat)
+
+    clear = two_folders(tmp_path / "clear", ["a/x.png", "b/y.png"])
+    write(clear)
+    assert import_two_folders(clear.parent, clear) == 1
+    open_to_both = two_folders(tmp_path / "both", ["a/x.png", "b/x.png", "b/y.png"])
+    write(open_to_both)
+    with pytest.raises(StoreError, match=r"images that have (no )?features"):
+        import_two_folders(open_to_both.parent, open_to_both)
+
+
 LIST = """
 a.png sub/b c.png
 0 3
