@@ -137,6 +137,8 @@ def _hloc_pairs(
     by_key: dict[str, str] = {}
     for written, name in _as_written(names).items():
         by_key[written.replace("/", "-")] = name
+    for name in names:  # whole names come before others that look like them
+        by_key[name.replace("/", "-")] = name
     unknown = []
     for key in source.groups_with(HLOC):
         found = list(_splits(key, "/", by_key)) or list(_splits(key, "_", by_key))

@@ -5,6 +5,7 @@ import io
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TextIO, overload
@@ -359,10 +360,11 @@ def split_of_others(
 def spellings(folder: Path) -> tuple[str, ...]:
     """Return how the path of a folder may begin those of the files in it, the longest first."""
     paths = {folder, folder.absolute(), resolved(folder)}
-    here = Path.cwd()
-    for path in tuple(paths):
-        if path.is_relative_to(here):  # as a shell lists its files
-            paths.add(path.relative_to(here))
+    with suppress(FileNotFoundError):  # the current folder may have been removed
+        here = Path.cwd()
+        for path in tuple(paths):
+            if path.is_relative_to(here):  # as a shell lists its files
+                paths.add(path.relative_to(here))
     found = {path.as_posix() for path in paths} - {".", "/"}
     return tuple(sorted(found, key=len, reverse=True))
 

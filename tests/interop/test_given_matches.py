@@ -120,6 +120,17 @@ def test_names_without_folders_are_read_where_one_image_is_called_so(
         import_two_folders(open_to_both.parent, open_to_both)
 
 
+def test_whole_names_come_before_names_without_folders_that_look_like_them(
+    tmp_path: Path,
+) -> None:
+    matches = two_folders(tmp_path, ["a.png", "x/y.png", "z/x-y.png"])
+    write_h5(matches, {"x-y.png/a.png": match_group([2, -1, -1])})
+    assert import_two_folders(tmp_path, matches) == 1
+    with open_database(tmp_path / "new.db") as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        assert database.exists_matches(ids["a.png"], ids["x/y.png"])
+
+
 LIST = """
 a.png sub/b c.png
 0 3
