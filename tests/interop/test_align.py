@@ -207,6 +207,26 @@ def test_positions_that_are_wrong_are_left_out_and_named(
     assert max(np.linalg.norm(center) for center in new.values()) < 300
 
 
+@pytest.mark.parametrize(("error_m", "is_said"), [(50.0, False), (300.0, True)])
+def test_places_that_are_off_by_as_much_as_they_spread_are_doubtful(
+    tmp_path: Path, *, error_m: float, is_said: bool
+) -> None:
+    """As GPS of photographs of something small; these spread 150 m."""
+    ring(tmp_path / "model")
+    rng = np.random.default_rng(1)
+    model = pycolmap.Reconstruction(tmp_path / "model")
+    rows = ["name,x,y,z"]
+    for name, place in true_centers(model).items():
+        wrong = 20.0 * place + rng.normal(0.0, error_m, 3)
+        rows.append(",".join([name, *map(str, wrong)]))
+    table = tmp_path / "positions.csv"
+    table.write_text("\n".join(rows))
+    done = align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
+    assert 100.0 < done.spread < 900.0
+    assert done.contradicts_itself == is_said
+    assert ("doubtful" in done.summary()) == is_said
+
+
 PLACES = np.array(
     [[11.0, 7, 5], [19, 7, 6], [19, 13, 5], [11, 12, 7], [14, 9, 9], [17, 11, 8]]
 )
