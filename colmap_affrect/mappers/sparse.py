@@ -19,6 +19,7 @@ from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
+from colmap_affrect.mappers.own_cameras import own_cameras, with_per_image_cameras
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.point_joining import joined_by_points
 from colmap_affrect.mappers.principal_points import (
@@ -328,6 +329,7 @@ class _HypothesisTest:
             self._try_colmap()
         self._try_straight_lens()
         self._try_shifted_axes()
+        self._look_at_own_cameras()
         self.best = with_other_groups(self.search, self.best)
         self.best = joined_by_points(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
@@ -460,7 +462,7 @@ class _HypothesisTest:
             return
         first = self.best[0]
         graph = self.per_image.graph.without(hypothesis.left_out)
-        model = _with_per_image_cameras(
+        model = with_per_image_cameras(
             self.per_image, graph, self.search, first.reconstruction
         )
         if model is None:
@@ -476,6 +478,17 @@ class _HypothesisTest:
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
+
+    def _look_at_own_cameras(self) -> None:
+        """Keep of models with shared cameras what cameras of their own would make of them."""
+        found = list[MappedModel]()
+        for mapped in self.best:
+            other = None
+            if self.per_image and not self.search.graph.has_rigs:
+                model = mapped.reconstruction
+                other = own_cameras(model, self.search, self.per_image)
+            found.append(replace(mapped, own_cameras=other))
+        self.best = found
 
     def _motion_share(self, mapped: MappedModel) -> float:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
@@ -508,30 +521,6 @@ def _remade(search: Search, mapped: MappedModel) -> MappedModel:
     """Return a model with its poses, adjusted with the cameras and pairs of a search."""
     model = search.grower(search.graph).remake(mapped.reconstruction)
     return replace(mapped, reconstruction=model)
-
-
-def _with_per_image_cameras(
-    per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
-) -> pycolmap.Reconstruction | None:
-    """Return a model with a camera for each image.
-
-    Args:
-        per_image: Makes the model.
-        graph: Its pairs.
-        shared: Scores the model with shared cameras.
-        model: The model with shared cameras.
-
-    Returns:
-        The model; None where it scores no higher with some of the tracks.
-    """
-    thin = graph.thinned()
-    if thin is not graph:
-        trial = per_image.comparing().grower(thin).restart_from(model)
-        per_image_score = replace(per_image.scorer, graph=thin).score(trial)
-        shared_score = replace(shared.scorer, graph=thin).score(model)
-        if per_image_score <= shared_score + MIN_SCORE_GAIN:
-            return None
-    return per_image.grower(graph).remake(model)
 
 
 def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:

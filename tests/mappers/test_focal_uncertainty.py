@@ -19,8 +19,8 @@ from colmap_affrect.mappers.camera_priors import USUAL_SIGMA, CameraPrior
 from colmap_affrect.mappers.focal_observability import (
     MIN_GROWTH,
     _growths,
-    fitting_focals,
     focal_growths,
+    freed_focals,
 )
 from colmap_affrect.mappers.focal_uncertainty import focal_sigmas
 
@@ -135,10 +135,17 @@ def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
     Adjuster(priors, NOISE_PX, refining).adjust(model, FINAL)
     task = MappingTask(Path("none.db"), None, cameras=records)
-    found = fitting_focals(model, task, priors)
-    assert found.keys() == set(expected)
-    for focal_px in found.values():
+    found = freed_focals(model, task, priors)
+    assert found.fitting_px.keys() == set(expected)
+    for focal_px in found.fitting_px.values():
         assert focal_px == pytest.approx(FOCAL_PX, rel=0.05)
+    assert found.other.turns_deg.keys() == {f"{key}.jpg" for key in IDS}
+    if expected:
+        assert found.other.log_odds > 0.5
+        assert min(found.other.turns_deg.values()) > 0.3
+    else:  # one in ten, as before points were seen
+        assert found.other.log_odds == pytest.approx(np.log(0.1), abs=0.3)
+        assert max(found.other.turns_deg.values()) < 0.3
 
 
 class FakeTrials:
