@@ -15,6 +15,7 @@ from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import (
+    LYING_LINES,
     CameraPrior,
     camera_priors,
     with_distortion_of,
@@ -40,9 +41,9 @@ MAX_GROWTH = 1.0  # that of a known focal length: more makes none surer; theory
 FREE_SIGMA = 1.0
 # Of the logarithm of a given focal length, from which on another one is named; display
 MIN_MOVE = 0.1
-WRONG_ODDS = 0.1
-"""Of given focal lengths, that they are wrong, before points are seen: of another lens, of an
-enlarged part, or guessed (judged)."""
+WRONG_SHARE = LYING_LINES
+"""Of given focal lengths, those of another lens or of enlarged parts, before points are seen: the
+same as of lines."""
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
 # More cameras than that are tried several at once, to save time; resource
@@ -231,18 +232,17 @@ def freed_focals(
     free_adjuster = Adjuster(
         priors=_with_free_focals(priors, given), noise_px=NOISE_PX, refining=refining
     )
-    free_model = with_fewer_points(model)
-    gain = given_cost - free_adjuster.adjust(free_model, FINAL)
-    is_each_wrong = _is_worth_parameters(gain, len(given), given_model)
-    if is_each_wrong or len(given) == 1:
-        moved = _moved_focals(free_model, priors, given) if is_each_wrong else {}
-        return FreedFocals(moved, _other_focals(given_model, free_model, gain))
-    # What is wrong in the same way everywhere is one parameter.
-    common_model = with_fewer_points(model)
-    gain = given_cost - adjust_common_factor(common_model, free_adjuster, sorted(given))
-    is_factor_wrong = _is_worth_parameters(gain, 1, given_model)
-    moved = _moved_focals(common_model, priors, given) if is_factor_wrong else {}
-    return FreedFocals(moved, _other_focals(given_model, common_model, gain))
+    freed_model = with_fewer_points(model)
+    gain = given_cost - free_adjuster.adjust(freed_model, FINAL)
+    is_wrong = _is_worth_parameters(gain, len(given), given_model)
+    if not is_wrong and len(given) > 1:
+        # What is wrong in the same way everywhere is one parameter.
+        freed_model = with_fewer_points(model)
+        cost = adjust_common_factor(freed_model, free_adjuster, sorted(given))
+        gain = given_cost - cost
+        is_wrong = _is_worth_parameters(gain, 1, given_model)
+    fitting_px = _moved_focals(freed_model, priors, given) if is_wrong else {}
+    return FreedFocals(fitting_px, _other_focals(given_model, freed_model, gain))
 
 
 def _other_focals(
@@ -257,7 +257,9 @@ def _other_focals(
     """
     if not math.isfinite(gain):
         return NO_OTHER_CAMERAS
-    log_odds = math.log(WRONG_ODDS) + gain * _counted_share(model)
+    log_odds = math.log(WRONG_SHARE / (1.0 - WRONG_SHARE)) + gain * _counted_share(
+        model
+    )
     return OtherCameras(log_odds, pose_turns_deg(model, freed))
 
 

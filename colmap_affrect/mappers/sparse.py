@@ -19,7 +19,11 @@ from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
-from colmap_affrect.mappers.own_cameras import own_cameras, with_per_image_cameras
+from colmap_affrect.mappers.own_cameras import (
+    MAX_OPEN_IMAGES,
+    own_cameras,
+    with_per_image_cameras,
+)
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.point_joining import joined_by_points
 from colmap_affrect.mappers.principal_points import (
@@ -484,8 +488,9 @@ class _HypothesisTest:
         found = list[MappedModel]()
         for mapped in self.best:
             other = None
-            if self.per_image and not self.search.graph.has_rigs:
-                model = mapped.reconstruction
+            model = mapped.reconstruction
+            is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
+            if self.per_image and is_small and not has_rigs(model):
                 other = own_cameras(model, self.search, self.per_image)
             found.append(replace(mapped, own_cameras=other))
         self.best = found
