@@ -131,8 +131,9 @@ class MappedModel:
     axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
     """By the names of images: how far rotations change where principal points that points
     contradict are freed, though that makes no better model."""
-    own_cameras: OtherCameras | None = None
-    """What a camera for each image would make of a model whose images share some by assumption."""
+    other_cameras: OtherCameras | None = None
+    """What a camera for each image would make of a model whose images share some by assumption, or
+    one camera where they have their own."""
     apart: Mapping[str, Doubt] = field(default_factory=dict)
     """By the names of images that were in the same model, why they are not in this one."""
     motion_share: float = 1.0

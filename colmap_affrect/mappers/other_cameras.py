@@ -25,6 +25,7 @@ class OtherPose:
 
     probability: float = 0.0  # of these cameras, against those of the model
     turn_deg: float = 0.0  # from the pose that the model has
+    is_shared: bool = False  # whether these are one camera
 
 
 NO_OTHER_POSE = OtherPose()
@@ -36,11 +37,12 @@ class OtherCameras:
 
     log_odds: float = -math.inf  # that they are right, against those of the model
     turns_deg: Mapping[str, float] = field(default_factory=dict)  # by image name
+    are_shared: bool = False  # one camera, where images of the model have their own
 
     def pose_of(self, name: str) -> OtherPose:
         """Return the pose of an image with these cameras."""
         probability = 0.5 * (1.0 + math.tanh(0.5 * self.log_odds))
-        return OtherPose(probability, self.turns_deg.get(name, 0.0))
+        return OtherPose(probability, self.turns_deg.get(name, 0.0), self.are_shared)
 
 
 NO_OTHER_CAMERAS = OtherCameras()

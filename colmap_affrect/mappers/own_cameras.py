@@ -1,11 +1,13 @@
 """A camera for each image in the place of shared ones: as a hypothesis, and as what stays open."""
 
+import math
 from dataclasses import replace
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers.focal_observability import num_independent
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
 
 MAX_OPEN_IMAGES = 8
@@ -31,6 +33,25 @@ def own_cameras(
     other_score = replace(per_image.scorer, graph=graph).score(other)
     score = replace(shared.scorer, graph=shared.graph.thinned()).score(model)
     return OtherCameras(other_score - score, pose_turns_deg(model, other))
+
+
+def one_camera(
+    model: pycolmap.Reconstruction, shared: pycolmap.Reconstruction, gain: float
+) -> OtherCameras:
+    """Return what one camera makes of a model whose images have their own.
+
+    What moves before a background along with the cameras is taken up by focal lengths of single
+    images: that fits a little better, by less than as many free parameters are worth (BIC).
+
+    Args:
+        model: It scores higher.
+        shared: The same images, which share cameras.
+        gain: By what the score is higher, in nats.
+    """
+    num_more = len(used_cameras(model)) - len(used_cameras(shared))
+    worth = 0.5 * math.log(max(2, num_independent(model))) * num_more
+    turns_deg = pose_turns_deg(model, shared)
+    return OtherCameras(worth - gain, turns_deg, are_shared=True)
 
 
 def with_per_image_cameras(

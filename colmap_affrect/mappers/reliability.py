@@ -227,7 +227,7 @@ def unfitted_factor(features: ReliabilityFeatures) -> float:
     """
     factor = _precision_factor(features) / (1.0 + _odds_of_two_scenes(features))
     factor *= _share_with_other_cameras(features.with_free_focals)
-    return factor * _share_with_other_cameras(features.with_own_cameras)
+    return factor * _share_with_other_cameras(features.with_other_cameras)
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
@@ -260,10 +260,11 @@ def _losses_by_other_cameras(features: ReliabilityFeatures) -> list[_Loss]:
         values = {"given_px": given_px, "fitting_px": features.fitting_focal_px}
         doubt = Doubt("focal_contradicted", {**values})
     by_focals = _share_with_other_cameras(features.with_free_focals)
-    by_own = _share_with_other_cameras(features.with_own_cameras)
-    turn_deg = features.with_own_cameras.turn_deg
-    shared = Doubt("camera_shared", {"turn_deg": turn_deg})
-    return [_Loss(-math.log(by_focals), doubt), _Loss(-math.log(by_own), shared)]
+    by_others = _share_with_other_cameras(features.with_other_cameras)
+    other = features.with_other_cameras
+    turn = {"turn_deg": other.turn_deg}
+    assumed = Doubt("cameras_differ" if other.is_shared else "camera_shared", {**turn})
+    return [_Loss(-math.log(by_focals), doubt), _Loss(-math.log(by_others), assumed)]
 
 
 def _share_with_other_cameras(other: OtherPose) -> float:

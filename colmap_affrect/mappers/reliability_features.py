@@ -95,8 +95,8 @@ class ReliabilityFeatures:
     those that are constant and nothing tells where they are."""
     with_free_focals: OtherPose = NO_OTHER_POSE
     """Its pose where given focal lengths are free."""
-    with_own_cameras: OtherPose = NO_OTHER_POSE
-    """Its pose where images have cameras of their own, which are taken for one camera."""
+    with_other_cameras: OtherPose = NO_OTHER_POSE
+    """Its pose where images that share a camera by assumption have their own, or the reverse."""
 
 
 class _ModelContext:
@@ -175,7 +175,7 @@ def features_of(
     rotation_ratios = _rotation_ratios(context)
     originals = _mirrored_originals(context)
     freed = freed_focals(context.model, task, context.priors)
-    own_cameras = mapped.own_cameras or NO_OTHER_CAMERAS
+    other_cameras = mapped.other_cameras or NO_OTHER_CAMERAS
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
@@ -208,7 +208,7 @@ def features_of(
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
             with_free_focals=freed.other.pose_of(names[image_id]),
-            with_own_cameras=own_cameras.pose_of(names[image_id]),
+            with_other_cameras=other_cameras.pose_of(names[image_id]),
         )
     return found
 

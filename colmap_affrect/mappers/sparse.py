@@ -21,6 +21,7 @@ from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.own_cameras import (
     MAX_OPEN_IMAGES,
+    one_camera,
     own_cameras,
     with_per_image_cameras,
 )
@@ -315,6 +316,8 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.per_image = per_image
+        # The model whose images shared cameras, and by what it scored lower
+        self.replaced: tuple[pycolmap.Reconstruction, float] | None = None
         self._begin_with_cameras_of(task.previous_models)
         self.best = _restarted(self.search, task.previous_models)
         self.score = self.search.best_score(self.best)
@@ -333,7 +336,7 @@ class _HypothesisTest:
             self._try_colmap()
         self._try_straight_lens()
         self._try_shifted_axes()
-        self._look_at_own_cameras()
+        self._look_at_other_cameras()
         self.best = with_other_groups(self.search, self.best)
         self.best = joined_by_points(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
@@ -474,6 +477,7 @@ class _HypothesisTest:
         score = self.per_image.scorer.score(model)
         if score <= self.score + MIN_SCORE_GAIN:
             return
+        self.replaced = first.reconstruction, score - self.score
         share = self._motion_share(first)
         changed = replace(first, reconstruction=model, motion_share=share)
         # The others, too: what is shared and what is not do not fit into one graph.
@@ -483,8 +487,8 @@ class _HypothesisTest:
         self.per_image = None
         self.score = self.search.best_score(self.best)
 
-    def _look_at_own_cameras(self) -> None:
-        """Keep of models with shared cameras what cameras of their own would make of them."""
+    def _look_at_other_cameras(self) -> None:
+        """Keep of models with shared cameras what own ones make of them, or the reverse."""
         found = list[MappedModel]()
         for mapped in self.best:
             other = None
@@ -492,7 +496,9 @@ class _HypothesisTest:
             is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
             if self.per_image and is_small and not has_rigs(model):
                 other = own_cameras(model, self.search, self.per_image)
-            found.append(replace(mapped, own_cameras=other))
+            elif self.replaced and not found:
+                other = one_camera(model, *self.replaced)
+            found.append(replace(mapped, other_cameras=other))
         self.best = found
 
     def _motion_share(self, mapped: MappedModel) -> float:

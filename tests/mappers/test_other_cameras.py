@@ -16,6 +16,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import sparse
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
+from colmap_affrect.mappers.own_cameras import one_camera
 from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.reliability_features import features_of
 
@@ -63,14 +64,14 @@ def test_photographs_of_one_camera_stay_where_they_are_with_own_ones(
     truth = synthesize(path, num_rigs=3, num_points3D=80, noise_px=0.5)
     task = task_of(path, truth)
     found = mapped(task, tmp_path)
-    assert found.own_cameras is not None
-    assert abs(found.own_cameras.log_odds) < 5.0
-    assert max(found.own_cameras.turns_deg.values()) < 2.0
+    assert found.other_cameras is not None
+    assert abs(found.other_cameras.log_odds) < 5.0
+    assert max(found.other_cameras.turns_deg.values()) < 2.0
     features = features_of(found, task)
     for name, of_image in features.items():
-        assert of_image.with_own_cameras == found.own_cameras.pose_of(name)
+        assert of_image.with_other_cameras == found.other_cameras.pose_of(name)
     known = mapped(MappingTask(path, None, cameras=task.cameras), tmp_path)
-    assert known.own_cameras is None  # nothing was taken for shared
+    assert known.other_cameras is None  # nothing was taken for shared
 
 
 def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
@@ -87,9 +88,25 @@ def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
         keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.3 + middle
         database.update_keypoints(image.image_id, keypoints)
     found = mapped(task, tmp_path)
-    assert found.own_cameras is not None
-    assert found.own_cameras.log_odds > 3.0
-    assert found.own_cameras.turns_deg[image.name] > 3.0
+    assert found.other_cameras is not None
+    assert found.other_cameras.log_odds > 3.0
+    assert found.other_cameras.turns_deg[image.name] > 3.0
     one = score_images(found, task)[image.name]
-    other = score_images(replace(found, own_cameras=None), task)[image.name]
+    other = score_images(replace(found, other_cameras=None), task)[image.name]
     assert one.probability < 0.7 * other.probability
+
+
+def test_cameras_of_their_own_are_as_likely_as_the_score_pays_for_their_number(
+    tmp_path: Path,
+) -> None:
+    """Three focal lengths more: half the logarithm of the number of cells each, about 7 nats."""
+    model = synthesize(tmp_path / "own.db", num_rigs=4, num_points3D=100)
+    shared = synthesize(
+        tmp_path / "one.db", num_rigs=1, num_frames_per_rig=4, num_points3D=100
+    )
+    hardly = one_camera(model, shared, 3.0)
+    clearly = one_camera(model, shared, 30.0)
+    assert hardly.log_odds - clearly.log_odds == pytest.approx(27.0)
+    assert 3.0 < hardly.log_odds < 8.0
+    assert hardly.are_shared
+    assert hardly.turns_deg == pose_turns_deg(model, shared)

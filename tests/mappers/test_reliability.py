@@ -24,7 +24,7 @@ from colmap_affrect.mappers.other_cameras import OtherPose
 from colmap_affrect.mappers.pair_graph import VerifiedPair
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
-from colmap_affrect.project.reasons import SENTENCES, Doubt
+from colmap_affrect.project.reasons import SENTENCES, Doubt, DoubtCode
 from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
@@ -235,14 +235,17 @@ def test_other_cameras_take_as_much_as_they_are_likely_and_turn_a_pose(
     pose: OtherPose, share: float
 ) -> None:
     before = confidence(GOOD).probability
-    shared = confidence(replace(GOOD, with_own_cameras=pose))
+    shared = confidence(replace(GOOD, with_other_cameras=pose))
     given = confidence(replace(GOOD, with_free_focals=pose))
     assert shared.probability / before == pytest.approx(share, abs=0.01)
     assert given.probability == pytest.approx(shared.probability)
+    differing = replace(GOOD, with_other_cameras=replace(pose, is_shared=True))
+    differ = confidence(differing)
+    assert differ.probability == pytest.approx(shared.probability)
     named = confidence(replace(GOOD, with_free_focals=pose, fitting_focal_px=910.2))
-    first = {one.reasons[0].text() for one in (shared, given, named)}
-    of_all = (SENTENCES["camera_shared"], SENTENCES["focal_unknown"], NAMED)
-    said = {text.format(turn_deg=60.0) for text in of_all}
+    first = {one.reasons[0].text() for one in (shared, differ, given, named)}
+    codes: tuple[DoubtCode, ...] = ("camera_shared", "cameras_differ", "focal_unknown")
+    said = {SENTENCES[code].format(turn_deg=60.0) for code in codes} | {NAMED}
     assert (first == said) == (share <= 0.5)
 
 
