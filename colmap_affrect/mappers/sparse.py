@@ -504,7 +504,8 @@ class _HypothesisTest:
         """Keep of models with shared cameras what own ones make of them, or the reverse."""
         found = list[MappedModel]()
         for mapped in self.best:
-            other = None
+            known = mapped.other_cameras  # of a model that was gone on from
+            other = known if known and known.are_shared else None
             model = mapped.reconstruction
             is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
             if self.per_image and is_small and not has_rigs(model):

@@ -37,6 +37,17 @@ def mapped(task: MappingTask, folder: Path) -> MappedModel:
     return found
 
 
+def enlarged(path: Path, truth: pycolmap.Reconstruction) -> pycolmap.Image:
+    """Enlarge the first photograph, and return it."""
+    image = truth.images[min(truth.reg_image_ids())]
+    middle = np.array([image.camera.width, image.camera.height]) / 2.0
+    with open_database(path) as database:
+        keypoints = database.read_keypoints(image.image_id)
+        keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.3 + middle
+        database.update_keypoints(image.image_id, keypoints)
+    return image
+
+
 def test_log_odds_of_any_size_are_a_probability() -> None:
     turns_deg = {"a.jpg": 7.0}
     for log_odds, probability in ((-math.inf, 0.0), (0.0, 0.5), (2.0, 0.881), (1e6, 1)):
@@ -81,12 +92,7 @@ def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
     task = task_of(path, truth)
-    image = truth.images[min(truth.reg_image_ids())]
-    middle = np.array([image.camera.width, image.camera.height]) / 2.0
-    with open_database(path) as database:
-        keypoints = database.read_keypoints(image.image_id)
-        keypoints[:, :2] = (keypoints[:, :2] - middle) * 1.3 + middle
-        database.update_keypoints(image.image_id, keypoints)
+    image = enlarged(path, truth)
     found = mapped(task, tmp_path)
     assert found.other_cameras is not None
     assert found.other_cameras.log_odds > 3.0
@@ -94,6 +100,22 @@ def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
     one = score_images(found, task)[image.name]
     other = score_images(replace(found, other_cameras=None), task)[image.name]
     assert one.probability < 0.7 * other.probability
+
+
+@pytest.mark.long
+def test_that_cameras_may_be_shared_is_kept_by_models_that_go_on(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
+    task = task_of(path, truth)
+    image = enlarged(path, truth)
+    found = mapped(task, tmp_path)
+    assert found.other_cameras is not None
+    assert found.other_cameras.are_shared
+    assert found.other_cameras.turns_deg[image.name] > 3.0
+    again = mapped(replace(task, previous_models=[found]), tmp_path)
+    assert again.other_cameras == found.other_cameras
 
 
 def test_cameras_of_their_own_are_as_likely_as_the_score_pays_for_their_number(
