@@ -37,6 +37,11 @@ def mapped(task: MappingTask, folder: Path) -> MappedModel:
     return found
 
 
+def task_names(task: MappingTask) -> list[str]:
+    """Return the names of all photographs."""
+    return [name for record in task.cameras.values() for name in record.names]
+
+
 def enlarged(path: Path, truth: pycolmap.Reconstruction) -> pycolmap.Image:
     """Enlarge the first photograph, and return it."""
     image = truth.images[min(truth.reg_image_ids())]
@@ -78,9 +83,10 @@ def test_photographs_of_one_camera_stay_where_they_are_with_own_ones(
     assert found.other_cameras is not None
     assert abs(found.other_cameras.log_odds) < 5.0
     assert max(found.other_cameras.turns_deg.values()) < 2.0
-    features = features_of(found, task)
-    for name, of_image in features.items():
-        assert of_image.with_other_cameras == found.other_cameras.pose_of(name)
+    assert {
+        name: of_image.with_other_cameras
+        for name, of_image in features_of(found, task).items()
+    } == {name: found.other_cameras.pose_of(name) for name in task_names(task)}
     known = mapped(MappingTask(path, None, cameras=task.cameras), tmp_path)
     assert known.other_cameras is None  # nothing was taken for shared
 
@@ -97,9 +103,11 @@ def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
     assert found.other_cameras is not None
     assert found.other_cameras.log_odds > 3.0
     assert found.other_cameras.turns_deg[image.name] > 3.0
-    one = score_images(found, task)[image.name]
-    other = score_images(replace(found, other_cameras=None), task)[image.name]
-    assert one.probability < 0.7 * other.probability
+    without = replace(found, other_cameras=None)
+    assert (
+        score_images(found, task)[image.name].probability
+        < 0.7 * score_images(without, task)[image.name].probability
+    )
 
 
 @pytest.mark.long

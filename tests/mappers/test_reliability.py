@@ -239,8 +239,7 @@ def test_other_cameras_take_as_much_as_they_are_likely_and_turn_a_pose(
     given = confidence(replace(GOOD, with_free_focals=pose))
     assert shared.probability / before == pytest.approx(share, abs=0.01)
     assert given.probability == pytest.approx(shared.probability)
-    differing = replace(GOOD, with_other_cameras=replace(pose, is_shared=True))
-    differ = confidence(differing)
+    differ = confidence(replace(GOOD, with_other_cameras=replace(pose, is_shared=True)))
     assert differ.probability == pytest.approx(shared.probability)
     named = confidence(replace(GOOD, with_free_focals=pose, fitting_focal_px=910.2))
     first = {one.reasons[0].text() for one in (shared, differ, given, named)}
