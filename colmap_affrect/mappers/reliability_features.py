@@ -16,10 +16,19 @@ from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.camera_priors import camera_priors, with_distortion_of
+from colmap_affrect.mappers.camera_priors import (
+    camera_priors,
+    is_off_center,
+    with_distortion_of,
+)
 from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
-from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
+from colmap_affrect.mappers.focal_observability import focal_growths, freed_focals
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
+from colmap_affrect.mappers.other_cameras import (
+    NO_OTHER_CAMERAS,
+    NO_OTHER_POSE,
+    OtherPose,
+)
 from colmap_affrect.mappers.pair_graph import (
     MAX_ERROR,
     MIN_NUM_MATCHES,
@@ -84,6 +93,10 @@ class ReliabilityFeatures:
     axis_turn_deg: float = 0.0
     """How far its rotations to others change with free principal points, where points contradict
     those that are constant and nothing tells where they are."""
+    with_free_focals: OtherPose = NO_OTHER_POSE
+    """Its pose where given focal lengths are free."""
+    with_other_cameras: OtherPose = NO_OTHER_POSE
+    """Its pose where images that share a camera by assumption have their own, or the reverse."""
 
 
 class _ModelContext:
@@ -161,7 +174,8 @@ def features_of(
     num_three_view_points = num_long_tracks(context.model, context.viewpoint_of)
     rotation_ratios = _rotation_ratios(context)
     originals = _mirrored_originals(context)
-    fitting_focals_px = fitting_focals(context.model, task, context.priors)
+    freed = freed_focals(context.model, task, context.priors)
+    other_cameras = mapped.other_cameras or NO_OTHER_CAMERAS
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
@@ -182,7 +196,7 @@ def features_of(
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
             focal_px=float(camera.mean_focal_length()),
-            fitting_focal_px=fitting_focals_px.get(key, 0.0),
+            fitting_focal_px=freed.fitting_px.get(key, 0.0),
             pure_rotation_ratio=_pure_rotation_ratio(
                 context, image_id, rotation_ratios
             ),
@@ -193,6 +207,8 @@ def features_of(
             num_cut_pair_inliers=len(cut_pair.matches) if cut_pair else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
+            with_free_focals=freed.other.pose_of(names[image_id]),
+            with_other_cameras=other_cameras.pose_of(names[image_id]),
         )
     return found
 
@@ -305,10 +321,13 @@ def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
 def _focal_spreads(
     context: _ModelContext, growths: Mapping[int, float]
 ) -> dict[Size, float]:
-    """Return the longest by the shortest focal length that the model tells, by image size."""
+    """Return the longest by the shortest focal length that the model tells, by image size.
+
+    Of cameras whose principal point was freed, parts of photographs have nothing wrong.
+    """
     focals_px: defaultdict[Size, list[float]] = defaultdict(list)
     for key, camera in context.used_cameras.items():
-        if growths.get(key, 0.0) >= MIN_TOLD:
+        if growths.get(key, 0.0) >= MIN_TOLD and not is_off_center(camera):
             focal_px = max(camera.mean_focal_length(), MIN_FOCAL_PX)
             focals_px[camera.width, camera.height].append(focal_px)
     return {size: max(of_size) / min(of_size) for size, of_size in focals_px.items()}

@@ -19,6 +19,12 @@ from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_motions import share_of_motion
+from colmap_affrect.mappers.own_cameras import (
+    MAX_OPEN_IMAGES,
+    one_camera,
+    own_cameras,
+    with_per_image_cameras,
+)
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.point_joining import joined_by_points
 from colmap_affrect.mappers.principal_points import (
@@ -322,6 +328,8 @@ class _HypothesisTest:
         self.by_colmap = by_colmap
         self.search = search
         self.per_image = per_image
+        # The model whose images shared cameras, and by what it scored lower
+        self.replaced: tuple[pycolmap.Reconstruction, float] | None = None
         self._begin_with_cameras_of(task.previous_models)
         self.best = _restarted(self.search, task.previous_models)
         self.score = self.search.best_score(self.best)
@@ -340,6 +348,7 @@ class _HypothesisTest:
             self._try_colmap()
         self._try_straight_lens()
         self._try_shifted_axes()
+        self._look_at_other_cameras()
         self.best = with_other_groups(self.search, self.best)
         self.best = joined_by_points(self.search, self.best)
         return _joined_by_tie_points(self.search, self.best)
@@ -473,7 +482,7 @@ class _HypothesisTest:
             return
         first = self.best[0]
         graph = self.per_image.graph.without(hypothesis.left_out)
-        model = _with_per_image_cameras(
+        model = with_per_image_cameras(
             self.per_image, graph, self.search, first.reconstruction
         )
         if model is None:
@@ -481,6 +490,7 @@ class _HypothesisTest:
         score = self.per_image.scorer.score(model)
         if score <= self.score + MIN_SCORE_GAIN:
             return
+        self.replaced = first.reconstruction, score - self.score
         share = self._motion_share(first)
         changed = replace(first, reconstruction=model, motion_share=share)
         # The others, too: what is shared and what is not do not fit into one graph.
@@ -489,6 +499,21 @@ class _HypothesisTest:
         self.search = self.per_image
         self.per_image = None
         self.score = self.search.best_score(self.best)
+
+    def _look_at_other_cameras(self) -> None:
+        """Keep of models with shared cameras what own ones make of them, or the reverse."""
+        found = list[MappedModel]()
+        for mapped in self.best:
+            known = mapped.other_cameras  # of a model that was gone on from
+            other = known if known and known.are_shared else None
+            model = mapped.reconstruction
+            is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
+            if self.per_image and is_small and not has_rigs(model):
+                other = own_cameras(model, self.search, self.per_image)
+            elif self.replaced and not found:
+                other = one_camera(model, *self.replaced)
+            found.append(replace(mapped, other_cameras=other))
+        self.best = found
 
     def _motion_share(self, mapped: MappedModel) -> float:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
@@ -512,27 +537,3 @@ def _remade(search: Search, mapped: MappedModel) -> MappedModel:
     """Return a model with its poses, adjusted with the cameras and pairs of a search."""
     model = search.grower(search.graph).remake(mapped.reconstruction)
     return replace(mapped, reconstruction=model)
-
-
-def _with_per_image_cameras(
-    per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
-) -> pycolmap.Reconstruction | None:
-    """Return a model with a camera for each image.
-
-    Args:
-        per_image: Makes the model.
-        graph: Its pairs.
-        shared: Scores the model with shared cameras.
-        model: The model with shared cameras.
-
-    Returns:
-        The model; None where it scores no higher with some of the tracks.
-    """
-    thin = graph.thinned()
-    if thin is not graph:
-        trial = per_image.comparing().grower(thin).restart_from(model)
-        per_image_score = replace(per_image.scorer, graph=thin).score(trial)
-        shared_score = replace(shared.scorer, graph=thin).score(model)
-        if per_image_score <= shared_score + MIN_SCORE_GAIN:
-            return None
-    return per_image.grower(graph).remake(model)
