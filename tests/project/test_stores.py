@@ -391,10 +391,13 @@ def test_what_is_linked_from_elsewhere_is_not_of_a_store(
     store.check_all()
 
 
-@pytest.mark.parametrize("changes", [
-    {"stationary": (((320, 240), ((1, 2), (99999, 0))),)},
-    {"backgrounds": (("a.png", "zz"),)},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"stationary": (((320, 240), ((1, 2), (99999, 0))),)},
+        {"backgrounds": (("a.png", "zz"),)},
+    ],
+)
 def test_places_that_are_none_are_damage(
     tmp_path: Path, changes: dict[str, object]
 ) -> None:

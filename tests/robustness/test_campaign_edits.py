@@ -181,10 +181,21 @@ def test_edited_record_makes_nothing_surer(
 
 STORES = ("features.h5", "matches.h5", "guided.h5")
 ODD_ATTRIBUTES = (
-    -1, 1, 7, 1 << 40, 0.5, float("nan"), "x", b"\xff", [1, 2], ["b.png", "a.png"], True,
+    -1,
+    1,
+    7,
+    1 << 40,
+    0.5,
+    float("nan"),
+    "x",
+    b"\xff",
+    [1, 2],
+    ["b.png", "a.png"],
+    True,
     '{"step": {"level": 7, "pairs": [["a.png", "z.png"]]}}',
-    '{"stationary": [[[320, 240], [[99999, -5]]]]}', '{"backgrounds": [["a.png", "zz"]]}',
-)  # fmt: skip
+    '{"stationary": [[[320, 240], [[99999, -5]]]]}',
+    '{"backgrounds": [["a.png", "zz"]]}',
+)
 
 
 def odd_attribute(file: h5py.File, chance: random.Random) -> str:
@@ -206,10 +217,15 @@ def odd_link(file: h5py.File, chance: random.Random) -> str:
     keys: list[str] = []
     file.visit(keys.append)
     key, source = chance.sample(keys, 2)
-    link = chance.choice((
-        h5py.SoftLink(f"/{source}"), h5py.SoftLink("/nowhere"), h5py.SoftLink(f"/{key}"),
-        h5py.ExternalLink(file.filename, f"/{source}"), h5py.ExternalLink("none.h5", "/x"),
-    ))  # fmt: skip
+    link = chance.choice(
+        (
+            h5py.SoftLink(f"/{source}"),
+            h5py.SoftLink("/nowhere"),
+            h5py.SoftLink(f"/{key}"),
+            h5py.ExternalLink(file.filename, f"/{source}"),
+            h5py.ExternalLink("none.h5", "/x"),
+        )
+    )
     del file[key]
     file[key] = link
     return f"{key} -> {link.path}"
