@@ -18,6 +18,7 @@ from colmap_affrect.mappers.final_points import complete_points, extract_colors
 from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import share_of_motion
 from colmap_affrect.mappers.own_cameras import (
     MAX_OPEN_IMAGES,
@@ -330,6 +331,8 @@ class _HypothesisTest:
         self.per_image = per_image
         # The model whose images shared cameras, and by what it scored lower
         self.replaced: tuple[pycolmap.Reconstruction, float] | None = None
+        # The last model that was tried with own cameras, and what these make of it
+        self.tried: tuple[pycolmap.Reconstruction, OtherCameras] | None = None
         self._begin_with_cameras_of(task.previous_models)
         self.best = _restarted(self.search, task.previous_models)
         self.score = self.search.best_score(self.best)
@@ -482,9 +485,12 @@ class _HypothesisTest:
             return
         first = self.best[0]
         graph = self.per_image.graph.without(hypothesis.left_out)
-        model = with_per_image_cameras(
+        own = with_per_image_cameras(
             self.per_image, graph, self.search, first.reconstruction
         )
+        if own.other:
+            self.tried = first.reconstruction, own.other
+        model = own.whole
         if model is None:
             return
         score = self.per_image.scorer.score(model)
@@ -504,16 +510,25 @@ class _HypothesisTest:
         """Keep of models with shared cameras what own ones make of them, or the reverse."""
         found = list[MappedModel]()
         for mapped in self.best:
-            known = mapped.other_cameras  # of a model that was gone on from
-            other = known if known and known.are_shared else None
-            model = mapped.reconstruction
-            is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
-            if self.per_image and is_small and not has_rigs(model):
-                other = own_cameras(model, self.search, self.per_image)
-            elif self.replaced and not found:
-                other = one_camera(model, *self.replaced)
+            other = self._with_own_cameras(mapped.reconstruction)
+            if other is None and self.replaced and not found:
+                other = one_camera(mapped.reconstruction, *self.replaced)
+            if other is None:
+                other = mapped.other_cameras  # of a model that was gone on from
+                other = other if other and other.are_shared else None
             found.append(replace(mapped, other_cameras=other))
         self.best = found
+
+    def _with_own_cameras(self, model: pycolmap.Reconstruction) -> OtherCameras | None:
+        """Return what own cameras make of a model that shares some; None if it is not tried."""
+        if self.per_image is None:
+            return None
+        if self.tried and self.tried[0] is model:
+            return self.tried[1]
+        is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
+        if not is_small or has_rigs(model):
+            return None
+        return own_cameras(model, self.search, self.per_image)
 
     def _motion_share(self, mapped: MappedModel) -> float:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
