@@ -19,11 +19,21 @@ def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
 ) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    listed = list(pairs)
+    partners = {image: {image} for image in images}
+    for first, second in listed:
+        partners.setdefault(first, {first}).add(second)
+        partners.setdefault(second, {second}).add(first)
+    if not partners:
+        return []
+    most = max(partners.values(), key=len)
+    if len(most) == len(partners):
+        return [most]  # one image is tied to all others
     import networkx  # which takes as long to load as numpy and OpenCV together
 
     graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
+    graph.add_nodes_from(partners)
+    graph.add_edges_from(listed)
     return sorted(
         networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
     )

@@ -1,0 +1,26 @@
+"""Which images pairs connect."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from colmap_affrect.colmap.connections import connected_parts
+
+
+def test_image_that_is_tied_to_all_others_connects_them_without_networkx(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "networkx", None)
+    assert connected_parts(list[tuple[int, int]]()) == []
+    assert connected_parts([(2, 1), (2, 3), (4, 2)]) == [{1, 2, 3, 4}]
+    assert connected_parts([(2, 1)], [1, 2]) == [{1, 2}]
+    with pytest.raises(ImportError):
+        connected_parts([(2, 1)], [1, 2, 3])
+
+
+def test_parts_are_found_where_no_image_is_tied_to_all_others() -> None:
+    chain = [(1, 2), (2, 3), (3, 4)]
+    assert connected_parts(chain) == [{1, 2, 3, 4}]
+    assert connected_parts([*chain, (5, 6)], [7]) == [{1, 2, 3, 4}, {5, 6}, {7}]
