@@ -14,6 +14,7 @@ import pyceres
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
@@ -65,6 +66,22 @@ def complete_points(
     refined = model.point3D_ids() - by_hand
     manager.filter_points3D(max_error_px, mapping.filter_min_tri_angle, refined)
     model.update_point_3d_errors()
+
+
+def extract_colors(
+    model: pycolmap.Reconstruction,
+    task: MappingTask,
+    native: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Give the points of a model the colours of photographs, where there are any.
+
+    Args:
+        model: Changed in place.
+        task: Has the folder of the photographs.
+        native: Say whether colours are wanted.
+    """
+    if native.extract_colors and task.image_path:
+        model.extract_colors_for_all_images(task.image_path)
 
 
 def _correspondences(

@@ -14,7 +14,7 @@ from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
-from colmap_affrect.mappers.final_points import complete_points
+from colmap_affrect.mappers.final_points import complete_points, extract_colors
 from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
@@ -28,6 +28,7 @@ from colmap_affrect.mappers.principal_points import (
     with_free_principal_points,
     with_shifted_axes,
 )
+from colmap_affrect.mappers.rigs import certain_models_of_rigs
 from colmap_affrect.mappers.search import Search, with_new_images
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
@@ -129,7 +130,7 @@ class SparseMapper(IncrementalMapper):
             return self._with_last_points(best, task, graph, native)
         for mapped in best:
             task.extend.restore(mapped.reconstruction)
-            _extract_colors(mapped.reconstruction, task, native)
+            extract_colors(mapped.reconstruction, task, native)
         return best
 
     def _map_small(
@@ -154,7 +155,12 @@ class SparseMapper(IncrementalMapper):
             return self._tested(task, some, native, show, by_colmap=list)
 
         by_colmap = list if task.without_pairs else whole_by_colmap
-        best = self._tested(task, graph, native, show, by_colmap)
+        best = list[MappedModel]()
+        if graph.has_rigs:
+            search = self._search(task, graph, native, show)
+            found = certain_models_of_rigs(search, bare, self.options, output_path)
+            best = [mapped.first_by(COLMAP_MODEL) for mapped in found]
+        best = best or self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_some)
         for mapped in best:
@@ -200,7 +206,7 @@ class SparseMapper(IncrementalMapper):
         def add_last_points(model: pycolmap.Reconstruction) -> None:
             tie_points = tie_points_of(task, graph)
             complete_points(model, graph, native, self.options.noise_px, tie_points)
-            _extract_colors(model, task, native)
+            extract_colors(model, task, native)
 
         return [replace(m, add_last_points=add_last_points) for m in models]
 
@@ -481,15 +487,6 @@ class _HypothesisTest:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
         found = share_of_motion(mapped.reconstruction, self.search.graph)
         return min(found, mapped.motion_share)
-
-
-def _extract_colors(
-    model: pycolmap.Reconstruction,
-    task: MappingTask,
-    native: pycolmap.IncrementalPipelineOptions,
-) -> None:
-    if native.extract_colors and task.image_path:
-        model.extract_colors_for_all_images(task.image_path)
 
 
 def _joined_by_tie_points(

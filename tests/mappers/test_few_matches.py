@@ -198,3 +198,31 @@ def test_tie_points_alone_begin_a_model(tmp_path: Path) -> None:
     assert len(model.registered_names) == 5
     assert len(model.tie_points) == 5 * 8
     assert largest_error_deg(tmp_path / "sparse" / "0", truth) < 2.0
+
+
+def test_frames_of_rigs_that_other_images_tie_need_no_few_matches(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(
+        path,
+        num_rigs=1,
+        num_cameras_per_rig=2,
+        num_frames_per_rig=3,
+        num_points3D=NUM_TARGETS,
+    )
+    without_geometries(path)
+    with open_database(path) as database:
+        frame_of = {i.image_id: i.frame_id for i in database.read_all_images()}
+        all_sure = {one.ids: one.matches for one in sure_few_matches(database, {})}
+        (ids, matches), *_ = all_sure.items()
+        others = {one.ids for one in sure_few_matches(database, {ids: matches})}
+    tied = {frame_of[image_id] for image_id in ids}
+    assert len(tied) == 2
+    expected = set[tuple[int, int]]()
+    for pair in all_sure:
+        if {frame_of[image_id] for image_id in pair} != tied:
+            expected.add(pair)
+    assert len(all_sure) == 3 * 4  # of each two frames two images by two
+    assert others == expected
+    assert len(others) == 2 * 4
