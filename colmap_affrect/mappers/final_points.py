@@ -100,6 +100,22 @@ def _correspondences(
     return found
 
 
+def extract_colors(
+    model: pycolmap.Reconstruction,
+    task: MappingTask,
+    native: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Give points the colours of photographs, where there are some and the options ask for it.
+
+    Args:
+        model: Changed in place.
+        task: Says where the photographs are.
+        native: The options.
+    """
+    if native.extract_colors and task.image_path:
+        model.extract_colors_for_all_images(task.image_path)
+
+
 def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:
     """Return the ids of the points that have fewer than two observations within a limit."""
     model.update_point_3d_errors()
