@@ -68,22 +68,6 @@ def complete_points(
     model.update_point_3d_errors()
 
 
-def extract_colors(
-    model: pycolmap.Reconstruction,
-    task: MappingTask,
-    native: pycolmap.IncrementalPipelineOptions,
-) -> None:
-    """Give the points of a model the colours of photographs, where there are any.
-
-    Args:
-        model: Changed in place.
-        task: Has the folder of the photographs.
-        native: Say whether colours are wanted.
-    """
-    if native.extract_colors and task.image_path:
-        model.extract_colors_for_all_images(task.image_path)
-
-
 def _correspondences(
     model: pycolmap.Reconstruction, graph: PairGraph
 ) -> pycolmap.CorrespondenceGraph:

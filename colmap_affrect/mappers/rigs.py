@@ -14,6 +14,8 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.search import Search
 
+COLMAP_MODEL = "from COLMAP's model"  # what made a model, in the words of a report
+
 logger = logging.getLogger(__name__)
 
 
@@ -46,4 +48,4 @@ def certain_models_of_rigs(
     are_known = not search.unknown
     model = models[0].reconstruction
     is_certain = search.is_certain(model, search.graph, agrees=are_known)
-    return models if is_certain else []
+    return [models[0].first_by(COLMAP_MODEL)] if is_certain else []

@@ -28,7 +28,7 @@ from colmap_affrect.mappers.principal_points import (
     with_free_principal_points,
     with_shifted_axes,
 )
-from colmap_affrect.mappers.rigs import certain_models_of_rigs
+from colmap_affrect.mappers.rigs import COLMAP_MODEL, certain_models_of_rigs
 from colmap_affrect.mappers.search import Search, with_new_images
 from colmap_affrect.mappers.some_tracks import (
     large_models,
@@ -44,7 +44,6 @@ MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
 AGAIN = "after pairs were matched again"
 PER_IMAGE_CAMERAS = "with a camera for each photograph"
-COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
 # Of COLMAP's models, the largest ones, that are gone on from; resource
@@ -170,8 +169,7 @@ class SparseMapper(IncrementalMapper):
         best = list[MappedModel]()
         if graph.has_rigs:
             search = self._search(task, graph, native, show)
-            found = certain_models_of_rigs(search, bare, self.options, output_path)
-            best = [mapped.first_by(COLMAP_MODEL) for mapped in found]
+            best = certain_models_of_rigs(search, bare, self.options, output_path)
         best = best or self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_some)

@@ -26,13 +26,9 @@ from colmap_affrect.mappers.focal_observability import (
 )
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.rigs import COLMAP_MODEL
 from colmap_affrect.mappers.search import first_pairs
-from colmap_affrect.mappers.sparse import (
-    ALL_PAIRS,
-    COLMAP_MODEL,
-    SparseMapper,
-    SparseOptions,
-)
+from colmap_affrect.mappers.sparse import ALL_PAIRS, SparseMapper, SparseOptions
 
 SIZE = (1024, 768)
 
