@@ -46,9 +46,8 @@ MIN_TOLD = 0.03
 parts of photographs it is 0.15."""
 # Strongest pairs of a frame that are compared with a pure rotation; resource
 NUM_ROTATION_PAIRS = 4
-NUM_RIG_ROTATION_PAIRS = (
-    2  # of frames that several pairs tie, as those of rigs; resource
-)
+# The same of a frame that several pairs tie to another one, as those of rigs; resource
+NUM_RIG_ROTATION_PAIRS = 2
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time; resource
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
