@@ -46,11 +46,8 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     for first, second in listed:
         partners[first].add(second)
         partners[second].add(first)
-    may_be_alone = [
-        partners[first].isdisjoint(partners[second]) for first, second in listed
-    ]
-    if not any(may_be_alone):
-        return []  # a third image ties each pair, too
+    if all(_is_tied_otherwise(*pair, partners) for pair in listed):
+        return []
     import networkx
 
     graph: networkx.Graph[T] = networkx.Graph()
@@ -60,6 +57,21 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
         if len(partners[first]) > 1 and len(partners[second]) > 1:
             found.append((min(first, second), max(first, second)))
     return found
+
+
+def _is_tied_otherwise(first: T, second: T, partners: Mapping[T, set[T]]) -> bool:
+    """Tell whether a third image ties two images, too, or a third and a fourth one.
+
+    Args:
+        first: Of the images.
+        second: The other one.
+        partners: Of each image those that it is tied to.
+    """
+    if not partners[first].isdisjoint(partners[second]):
+        return True
+    others = partners[second] - {first}
+    thirds = partners[first] - {second}
+    return any(not others.isdisjoint(partners[third]) for third in thirds)
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
