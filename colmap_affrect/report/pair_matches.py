@@ -17,7 +17,9 @@ from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
-NUM_KEPT = 200  # photographs whose features are kept in memory
+# Photographs whose features are kept in memory, 0.2 MB each: pairs go back to all that a
+# photograph is verified with; resource
+NUM_KEPT = 1_000
 
 
 class MatchKind(IntEnum):
@@ -65,23 +67,23 @@ class PairReader:
         # Share of inliers, by verified pair
         self.agreement = agreements(self.graph, self.model)
         self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
+        self._keypoints = lru_cache(NUM_KEPT)(self._read_keypoints)
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
         sizes = []
         keypoints = []
+        ids = self.graph.ids
+        for name in names:
+            require_known(name, ids)
+            camera = self.graph.cameras[name]
+            sizes.append((camera.width, camera.height))
+            keypoints.append(self._keypoints(name))
+        pair_ids = (ids[names[0]], ids[names[1]])
         with self.graph.open_to_read() as database:
-            images = {image.name: image for image in database.read_all_images()}
-            for name in names:
-                require_known(name, images)
-                camera = database.read_camera(images[name].camera_id)
-                sizes.append((camera.width, camera.height))
-                rows = database.read_keypoints(images[name].image_id)
-                keypoints.append(np.asarray(rows[:, :2], np.float64))
-            ids = (images[names[0]].image_id, images[names[1]].image_id)
-            raw = np.asarray(database.read_matches(*ids), np.int64).reshape(-1, 2)
-            geometry = database.read_two_view_geometry(*ids)
-            is_matched = database.exists_matches(*ids)
+            raw = np.asarray(database.read_matches(*pair_ids), np.int64).reshape(-1, 2)
+            geometry = database.read_two_view_geometry(*pair_ids)
+            is_matched = database.exists_matches(*pair_ids)
         inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         tie_points = self._tie_points(names, keypoints)
         num_tie_points = len(tie_points[0])
@@ -129,6 +131,12 @@ class PairReader:
             kinds = np.maximum(kinds, stored[matches[:, side]])
         return kinds
 
+    def _read_keypoints(self, name: str) -> Array:
+        """Return (N, 2) px from the upper left corner of a photograph."""
+        with self.graph.open_to_read() as database:
+            rows = database.read_keypoints(self.graph.ids[name])
+        return np.asarray(rows[:, :2], np.float64)
+
     def _read_stored_kinds(self, name: str) -> Indices:
         """Return the kinds of the features of a photograph; none where the run has none."""
         if not self.run:
@@ -159,14 +167,14 @@ class PairReader:
         return [np.array(points[0]).reshape(-1, 2), np.array(points[1]).reshape(-1, 2)]
 
     def _text(self, names: Pair, num_raw: int, num_inliers: int) -> str:
-        """Return how many matches a pair has, of which level, and what the model says."""
-        text = f"{num_raw} raw matches"
+        """Return how many matches a pair has, how they came, and what the model says."""
+        text = f"{num_raw} matches"
         if self.run:
             pair = (min(names), max(names))
             # Another program has matched the pair, and not the run
             with suppress(StoreError):
                 level = self.run.matches.levels([pair])[pair]
-                text += f" of level {level} ({self.run.extraction.levels[level].name})"
+                text += f" by {self.run.extraction.levels[level].name}"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))
         if share is not None:
