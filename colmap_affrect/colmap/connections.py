@@ -46,7 +46,11 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     for first, second in listed:
         partners[first].add(second)
         partners[second].add(first)
-    if all(_is_tied_otherwise(*pair, partners) for pair in listed):
+    between_parts = list[tuple[T, T]]()
+    for first, second in listed:
+        if len(partners[first]) > 1 and len(partners[second]) > 1:
+            between_parts.append((first, second))
+    if all(_is_tied_otherwise(*pair, partners) for pair in between_parts):
         return []
     import networkx
 

@@ -36,5 +36,6 @@ def test_images_that_third_and_fourth_ones_tie_have_no_lone_tie_without_networkx
     assert lone_ties(pentagon) == []
     monkeypatch.setitem(sys.modules, "networkx", None)
     assert lone_ties([*square, *triangle]) == []
+    assert lone_ties([*square, (4, 9)]) == []  # of a part of one image
     with pytest.raises(ImportError):
         lone_ties(pentagon)
