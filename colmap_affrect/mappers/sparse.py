@@ -35,6 +35,7 @@ from colmap_affrect.mappers.principal_points import (
     with_free_principal_points,
     with_shifted_axes,
 )
+from colmap_affrect.mappers.rigs import COLMAP_MODEL, certain_models_of_rigs
 from colmap_affrect.mappers.search import Search, with_new_images
 from colmap_affrect.mappers.some_tracks import (
     large_models,
@@ -50,7 +51,6 @@ MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
 AGAIN = "after pairs were matched again"
 PER_IMAGE_CAMERAS = "with a camera for each photograph"
-COLMAP_MODEL = "from COLMAP's model"
 SHIFTED_AXES = "with optical axes off the middle"
 
 # Of COLMAP's models, the largest ones, that are gone on from; resource
@@ -173,7 +173,11 @@ class SparseMapper(IncrementalMapper):
             return self._tested(task, some, native, show, by_colmap=list)
 
         by_colmap = list if task.without_pairs else whole_by_colmap
-        best = self._tested(task, graph, native, show, by_colmap)
+        best = list[MappedModel]()
+        if graph.has_rigs:
+            search = self._search(task, graph, native, show)
+            best = certain_models_of_rigs(search, bare, self.options, output_path)
+        best = best or self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_some)
         for mapped in best:
