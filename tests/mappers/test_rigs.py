@@ -24,11 +24,12 @@ from colmap_affrect.mappers.focal_observability import (
     focal_growths,
     with_fewer_points,
 )
+from colmap_affrect.mappers.hypotheses import ALL_PAIRS
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.rigs import COLMAP_MODEL
 from colmap_affrect.mappers.search import first_pairs
-from colmap_affrect.mappers.sparse import ALL_PAIRS, SparseMapper, SparseOptions
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 
 SIZE = (1024, 768)
 
