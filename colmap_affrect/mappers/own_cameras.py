@@ -1,11 +1,11 @@
 """A camera for each image in the place of shared ones: as a hypothesis, and as what stays open."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.focal_observability import num_independent
-from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN
+from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
 from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
@@ -14,6 +14,17 @@ MAX_OPEN_IMAGES = 8
 """Of models that are looked at, which takes a quarter of the time of mapping. With more images
 cameras of their own score higher where they are right: measured with 8 to 11 of enlarged parts,
 while of 3 to 5 no score tells; resource."""
+
+
+@dataclass(frozen=True)
+class OwnCameras:
+    """What a camera for each image makes of a model whose images share some."""
+
+    whole: pycolmap.Reconstruction | None
+    """The model with them; None where it scores no higher with some of the tracks."""
+    other: (
+        OtherCameras | None
+    )  # what stays open where they score no higher; None: not looked at
 
 
 def own_cameras(
@@ -30,7 +41,24 @@ def own_cameras(
     """
     graph = per_image.graph.thinned()
     other = per_image.comparing().grower(graph).remake(model)
-    other_score = replace(per_image.scorer, graph=graph).score(other)
+    return _compared(model, other, shared, replace(per_image.scorer, graph=graph))
+
+
+def _compared(
+    model: pycolmap.Reconstruction,
+    other: pycolmap.Reconstruction,
+    shared: Search,
+    scorer: ModelScorer,
+) -> OtherCameras:
+    """Return by how much another model scores higher, and how far its poses turn.
+
+    Args:
+        model: The model, whose images share cameras.
+        other: The same with a camera for each image.
+        shared: Scores the model.
+        scorer: Scores the other one, by some of the tracks.
+    """
+    other_score = scorer.score(other)
     score = replace(shared.scorer, graph=shared.graph.thinned()).score(model)
     return OtherCameras(other_score - score, pose_turns_deg(model, other))
 
@@ -56,23 +84,29 @@ def one_camera(
 
 def with_per_image_cameras(
     per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
-) -> pycolmap.Reconstruction | None:
-    """Return a model with a camera for each image.
+) -> OwnCameras:
+    """Give each image of a model a camera of its own.
 
     Args:
         per_image: Makes the model.
         graph: Its pairs.
         shared: Scores the model with shared cameras.
-        model: The model with shared cameras.
-
-    Returns:
-        The model; None where it scores no higher with some of the tracks.
+        model: The model with shared cameras; it stays as it is.
     """
+    is_looked_at = model.num_reg_images() <= MAX_OPEN_IMAGES
     thin = graph.thinned()
     if thin is not graph:
-        trial = per_image.comparing().grower(thin).restart_from(model)
-        per_image_score = replace(per_image.scorer, graph=thin).score(trial)
+        grower = per_image.comparing().grower(thin)
+        trial = grower.restart_from(model)
+        scorer = replace(per_image.scorer, graph=thin)
         shared_score = replace(shared.scorer, graph=thin).score(model)
-        if per_image_score <= shared_score + MIN_SCORE_GAIN:
-            return None
-    return per_image.grower(graph).remake(model)
+        if scorer.score(trial) <= shared_score + MIN_SCORE_GAIN:
+            if not is_looked_at:
+                return OwnCameras(None, None)
+            grower.adjust_fully(trial)
+            return OwnCameras(None, _compared(model, trial, shared, scorer))
+    whole = per_image.grower(graph).remake(model)
+    if thin is not graph or not is_looked_at:
+        return OwnCameras(whole, None)
+    scorer = replace(per_image.scorer, graph=graph)
+    return OwnCameras(whole, _compared(model, whole, shared, scorer))

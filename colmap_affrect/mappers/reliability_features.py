@@ -4,7 +4,7 @@ See :mod:`colmap_affrect.mappers.reliability`.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,7 @@ from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     MIN_SHARE,
     Ids,
+    PairGraph,
     VerifiedPair,
     cameras_of,
     graph_of,
@@ -54,6 +55,8 @@ MIN_TOLD = 0.03
 parts of photographs it is 0.15."""
 # Strongest pairs of a frame that are compared with a pure rotation; resource
 NUM_ROTATION_PAIRS = 4
+# The same of a frame that several pairs tie to another one, as those of rigs; resource
+NUM_RIG_ROTATION_PAIRS = 2
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time; resource
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
@@ -241,8 +244,7 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
     """Return the share of matches that a rotation explains, of the strongest pairs of frames."""
     strongest = dict[Ids, VerifiedPair]()
     for pairs in context.pairs_of_frames.values():
-        ranked = sorted(pairs, key=lambda pair: -len(pair.matches))
-        for pair in ranked[:NUM_ROTATION_PAIRS]:
+        for pair in _strongest_to_frames(context, pairs):
             strongest[pair.ids] = pair
     found = {}
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
@@ -252,6 +254,27 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
         points1, points2 = context.graph.points(pair)
         found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
     return found
+
+
+def _strongest_to_frames(
+    context: _ModelContext, pairs: Sequence[VerifiedPair]
+) -> list[VerifiedPair]:
+    """Return the strongest pairs of a frame with others.
+
+    Rigs take several images at once: all pairs of two frames tell the same of how they moved.
+
+    Args:
+        context: Of the model.
+        pairs: Of the frame.
+    """
+    found = dict[frozenset[int], VerifiedPair]()
+    is_of_rig = False
+    for pair in sorted(pairs, key=lambda pair: -len(pair.matches)):
+        frames = frozenset(map(context.frame_of, pair.ids))
+        is_of_rig = is_of_rig or frames in found
+        found.setdefault(frames, pair)
+    most = NUM_RIG_ROTATION_PAIRS if is_of_rig else NUM_ROTATION_PAIRS
+    return list(found.values())[:most]
 
 
 def _pure_rotation_ratio(
@@ -310,12 +333,20 @@ def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
     step = sampling_step(len(graph.pairs), MAX_MIRRORED_PAIRS)
     for pair in graph.pairs[::step]:
         first, second = pair.ids
+        if _is_of_rig(graph, first) and _is_of_rig(graph, second):
+            continue  # prints and scans are mirrored, what a rig takes is not
         share = mirrored_share(
             graph.keypoints[first], graph.keypoints[second], graph.sizes(pair.ids)
         )
         if share >= MIN_MIRRORED_SHARE:
             found.append(pair.ids)
     return found
+
+
+def _is_of_rig(graph: PairGraph, image_id: int) -> bool:
+    """Tell whether a rig of several sensors took an image."""
+    frame = graph.cache.frames[graph.cache.images[image_id].frame_id]
+    return bool(graph.cache.rigs[frame.rig_id].num_sensors() > 1)
 
 
 def _focal_spreads(
