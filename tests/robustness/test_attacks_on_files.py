@@ -240,11 +240,14 @@ def test_list_that_repeats_a_name_asks_for_it_once(
     assert len(asked) < 10
 
 
-@pytest.mark.parametrize("setting", [
-    "max_image_size_px=0x" + "f" * 6000,
-    "max_image_size_px=" + "9" * 4000,
-    "summary=[" + "1," * 5000 + "]",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "max_image_size_px=0x" + "f" * 6000,
+        "max_image_size_px=" + "9" * 4000,
+        "summary=[" + "1," * 5000 + "]",
+    ],
+)
 def test_number_of_any_length_is_one_short_line(setting: str) -> None:
     with pytest.raises(OptionError) as caught:
         load_recipe("unrectified-rootsift", [setting])
@@ -262,14 +265,20 @@ def test_text_that_is_longer_than_any_list_is_not_read(tmp_path: Path) -> None:
         load_recipe(str(path))
 
 
-@pytest.mark.parametrize(("flag", "value", "said"), [
-    ("--recipe", "", "is empty"), ("--depth-path", "", "is empty"), ("--scheduler", "", "is empty"),
-    ("--max-failures", "-1", "invalid count"), ("--reject-pair", '"a.png', "give A,B"),
-    ("--reject-pair", f'"{"x" * 200_000}",b', "give A,B"),
-    ("--camera-params", ",,,", "holds no numbers"),
-    ("--camera-params", "1e308,1,1,1", "params='1e308'"),
-    ("--principal-point", "1e9,-1e9", "less than or equal"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flag", "value", "said"),
+    [
+        ("--recipe", "", "is empty"),
+        ("--depth-path", "", "is empty"),
+        ("--scheduler", "", "is empty"),
+        ("--max-failures", "-1", "invalid count"),
+        ("--reject-pair", '"a.png', "give A,B"),
+        ("--reject-pair", f'"{"x" * 200_000}",b', "give A,B"),
+        ("--camera-params", ",,,", "holds no numbers"),
+        ("--camera-params", "1e308,1,1,1", "params='1e308'"),
+        ("--principal-point", "1e9,-1e9", "less than or equal"),
+    ],
+)
 def test_value_that_means_nothing_is_refused(
     photos: Path, tmp_path: Path, call: Call, flag: str, value: str, said: str
 ) -> None:
