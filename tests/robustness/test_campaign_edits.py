@@ -28,13 +28,39 @@ RECORDS = ("cameras.json", "sparse/0/summary.json")
 TEXTS = ("config.toml", "database.db.seal", "pairs.txt", "report.json", "run.log")
 NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+)?(?![\w.\"])")
 ODD_NUMBERS = (
-    "NaN", "Infinity", "-Infinity", "nan", "1e999", "-1", "0", "true", "null", '"x"', "[]", "{}",
-    "9" * 400, "9" * 5000, "1e308", "0x10", "1,5", "1_000", "07", "٣",
-)  # fmt: skip
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "nan",
+    "1e999",
+    "-1",
+    "0",
+    "true",
+    "null",
+    '"x"',
+    "[]",
+    "{}",
+    "9" * 400,
+    "9" * 5000,
+    "1e308",
+    "0x10",
+    "1,5",
+    "1_000",
+    "07",
+    "٣",
+)
 ODD_NAMES = (
-    "z.png", "../../etc/passwd", "", "a.png ", "A.PNG", "side/c\u030c.png", "\\ud800", "\\u0000",
-    "b-c.png", "a" * 5000,
-)  # fmt: skip
+    "z.png",
+    "../../etc/passwd",
+    "",
+    "a.png ",
+    "A.PNG",
+    "side/c\u030c.png",
+    "\\ud800",
+    "\\u0000",
+    "b-c.png",
+    "a" * 5000,
+)
 
 Edit = Callable[[str, random.Random], bytes]
 
@@ -133,9 +159,20 @@ def moved_values(text: str, chance: random.Random) -> bytes:
 
 
 EDITS: tuple[Edit, ...] = (
-    truncated, odd_number, odd_number, other_number, other_number, other_name, swapped, doubled,
-    without_a_line, saved_otherwise, of_another_program, moved_values, moved_values,
-)  # fmt: skip
+    truncated,
+    odd_number,
+    odd_number,
+    other_number,
+    other_number,
+    other_name,
+    swapped,
+    doubled,
+    without_a_line,
+    saved_otherwise,
+    of_another_program,
+    moved_values,
+    moved_values,
+)
 
 
 def said_of(out: Path) -> dict[str, Any]:

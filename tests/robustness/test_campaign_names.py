@@ -21,11 +21,24 @@ from colmap_affrect.interop.export import FORMATS
 pytestmark = CAMPAIGN
 
 NAMES = (
-    "{photos}/b-c.png", "{world}/elsewhere/new.png", "../../../photos/b-c.png",
-    "side/../../../../../photos/x.png", "x.png", "x.png/..", "..", "C:\\x.png", "..\\..\\x.png",
-    "\u202egnp.x", "line\nbreak.png", "~/x.png", "-rf.png", "/".join(["deep" * 12] * 20) + "/x.png",
-    "dense/images/x.png", "sparse/0/cameras.bin", "",
-)  # fmt: skip
+    "{photos}/b-c.png",
+    "{world}/elsewhere/new.png",
+    "../../../photos/b-c.png",
+    "side/../../../../../photos/x.png",
+    "x.png",
+    "x.png/..",
+    "..",
+    "C:\\x.png",
+    "..\\..\\x.png",
+    "\u202egnp.x",
+    "line\nbreak.png",
+    "~/x.png",
+    "-rf.png",
+    "/".join(["deep" * 12] * 20) + "/x.png",
+    "dense/images/x.png",
+    "sparse/0/cameras.bin",
+    "",
+)
 """Of an image in the place of a.png; x.png is harmless. A photograph is where a name leads."""
 
 RESULTS = {
