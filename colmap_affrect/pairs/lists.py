@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TextIO, overload
 
@@ -18,6 +19,7 @@ from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import resolved
+from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
@@ -239,6 +241,20 @@ def read_pairs(
     return PairList(ordered, numbers)
 
 
+def read_pairs_once(
+    path: Path, names: Sequence[str], image_path: Path | None = None
+) -> PairList:
+    """Return a pair list as :func:`read_pairs`, read once while size and times stay as they are."""
+    return _read_once(path, stamp_of([path]), tuple(names), image_path)
+
+
+@lru_cache(maxsize=4)
+def _read_once(
+    path: Path, _: str, names: tuple[str, ...], image_path: Path | None
+) -> PairList:
+    return read_pairs(path, names, image_path)
+
+
 def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Indices:
     """Return each pair of a list as one number, as :func:`_codes` says, (N,).
 
@@ -298,7 +314,9 @@ def _codes(
     """
     number = {name: index for index, name in enumerate(names)}
     for line_number, line in enumerate(lines, start=1):
-        pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
+        pair = _two_words(line, number)
+        pair = pair or split_line(line.rstrip("\n"), number)
+        pair = pair or split_line(line.strip(), number)
         pair = pair or _split_of_others(line, number, folders)
         if pair:
             low, high = sorted((number[pair[0]], number[pair[1]]))
@@ -322,6 +340,17 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     has_blanks = any(re.search(r"\s", name) for name in names)
     separator = "\t" if has_blanks else " "
     replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
+    _read_once.cache_clear()  # it may have changed within one tick of the clock
+
+
+def _two_words(line: str, known: Collection[str]) -> Pair | None:
+    """Return the names of a line as most are, which can be split in one way only."""
+    words = line.split()
+    if len(words) != 2 or "," in line:
+        return None
+    first, second = words
+    is_bare = line == f"{first} {second}\n"
+    return (first, second) if is_bare and first in known and second in known else None
 
 
 def split_line(line: str, known: Collection[str]) -> Pair | None:

@@ -10,7 +10,7 @@ from typing import Any
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord, read_camera_records
 from colmap_affrect.errors import NoModelError, OptionError, shown, such_as
-from colmap_affrect.geometry.lines import LineCamera, Lines
+from colmap_affrect.geometry.lines import LineCamera, LineFindings
 from colmap_affrect.mappers.camera_priors import (
     FocalContradiction,
     focal_contradictions,
@@ -198,7 +198,7 @@ def cameras_of_report(
 
 
 def lines_of_report(
-    features: FeatureStore, lines: Mapping[str, Lines]
+    features: FeatureStore, lines: Mapping[str, LineFindings]
 ) -> dict[str, LineReport]:
     """Return what straight lines say of photographs.
 
@@ -211,7 +211,7 @@ def lines_of_report(
 
 
 def contradictions_of_report(
-    context: Context, lines: Mapping[str, Lines]
+    context: Context, lines: Mapping[str, LineFindings]
 ) -> tuple[FocalContradiction, ...]:
     """Return the focal lengths of EXIF and of the user that straight lines contradict.
 
@@ -225,7 +225,7 @@ def contradictions_of_report(
         if record.source not in TRUSTED:
             continue
         for name in record.names:
-            by_lines = lines[name].camera() if name in lines else None
+            by_lines = lines[name].camera if name in lines else None
             if by_lines is not None:
                 line_cameras[name] = by_lines
     cameras = {}

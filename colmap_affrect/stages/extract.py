@@ -87,12 +87,14 @@ def extract(
     if contents != known:  # those that were there before were seen to be good
         warned += inputs.check_names(names)
     without_mask = _mask_warnings(inputs, names)
-    resources = context.resources
-    progress = context.progress
-    extractor = one_image.prepare(recipe.extraction, resources, names, progress)
+    extractor = None
+    if _names_to_extract(known, contents):
+        extractor = one_image.prepare(
+            recipe.extraction, context.resources, names, context.progress
+        )
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
-    _record(context, inputs, recipe, extractor, later=later or {}, overwrite=overwrite)
+    _record(context, inputs, recipe, later=later or {}, overwrite=overwrite)
     warned += _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
@@ -102,9 +104,12 @@ def extract(
         warned += _warnings_of_the_folder(inputs, names)
     warned += without_mask
     _log_warnings(warned)
-    failures, warned_of_images = _extract_missing(
-        context, inputs, extractor, names=missing, contents=contents
-    )
+    failures = dict[str, ImageFailure]()
+    warned_of_images = list[StageWarning]()
+    if extractor:
+        failures, warned_of_images = _extract_missing(
+            context, inputs, extractor, names=missing, contents=contents
+        )
     _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
@@ -148,16 +153,16 @@ def _record(
     context: Context,
     inputs: Inputs,
     recipe: Recipe,
-    extractor: ImageExtractor,
     *,
     later: Mapping[str, Options],
     overwrite: bool,
 ) -> None:
     """Put what was given on record, and the options that later stages take where none are given."""
+    weights = one_image.find_weights(recipe.extraction, context.resources)
     options = {
         **inputs.to_mapping(),
         **recipe.extraction.to_mapping(),
-        WEIGHTS: digests(extractor.weights),
+        WEIGHTS: digests(weights),
     }
     planned = {**recipe.later_stages, **later}
     context.workspace.record_options(
@@ -378,6 +383,19 @@ def _refuse_other_photographs(
                 Option("output-path"),
             ),
         )
+
+
+def _names_to_extract(
+    known: Mapping[str, Content], now: Mapping[str, Content]
+) -> list[str]:
+    """Return the images that have no features, or those of other files.
+
+    Args:
+        known: what the files held that features are from, by image.
+        now: what the files hold, by image.
+    """
+    changed = set(_changed(known, now))
+    return [name for name in now if name not in known or name in changed]
 
 
 def _changed(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:
