@@ -108,6 +108,8 @@ def _geometry(
 ) -> pycolmap.TwoViewGeometry | None:
     """Return the two-view geometry of points, those of a row match; its inliers are rows, twice.
 
+    As many samples are drawn as find a geometry that is trusted: with fewer inliers none is.
+
     Args:
         cameras: Of both images.
         points: (M, 2) px in both images.
@@ -117,13 +119,16 @@ def _geometry(
         The geometry; None where fewer than ``MIN_FEW`` matches agree with one.
     """
     rows = np.arange(len(points[0]), dtype=np.uint32)
+    trusted = options.changed(
+        min_num_inliers=MIN_FEW, ransac_min_inlier_ratio=MIN_INLIER_SHARE
+    )
     geometry = pycolmap.estimate_two_view_geometry(
         cameras[0],
         points[0].astype(np.float64),
         cameras[1],
         points[1].astype(np.float64),
         np.stack([rows, rows], axis=1),
-        two_view_options(options.changed(min_num_inliers=MIN_FEW)),
+        two_view_options(trusted),
     )
     is_rejected = geometry.config in REJECTED
     if is_rejected or len(geometry.inlier_matches) < MIN_FEW:

@@ -14,6 +14,7 @@ import pyceres
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.tie_points import TiePoints
 
@@ -81,6 +82,16 @@ def _correspondences(
             found.add_two_view_geometry(*pair.ids, pair.geometry)
     found.finalize()
     return found
+
+
+def extract_colors(
+    model: pycolmap.Reconstruction,
+    task: MappingTask,
+    native: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Give points the colours of photographs, where there are some and the options ask for it."""
+    if native.extract_colors and task.image_path:
+        model.extract_colors_for_all_images(task.image_path)
 
 
 def _failing(model: pycolmap.Reconstruction, max_error_px: float) -> set[int]:

@@ -39,7 +39,7 @@ from colmap_affrect.mappers.few_matches import (
     FewMatches,
     sure_few_matches,
 )
-from colmap_affrect.mappers.thinning import matches_of_best_tracks
+from colmap_affrect.mappers.thinning import MAX_SHARE, matches_of_best_tracks
 
 Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
@@ -239,14 +239,12 @@ class PairGraph:
         """
         matches = [(pair.ids, pair.matches) for pair in self.verified]
         num_keypoints = {i: len(points) for i, points in self.keypoints.items()}
-        kept_matches = matches_of_best_tracks(matches, num_keypoints)
-        num_kept = sum(map(np.sum, kept_matches))
-        num_all = sum(map(len, kept_matches))
-        if 2 * num_kept > num_all:
+        best = matches_of_best_tracks(matches, num_keypoints)
+        if best.share_of_features > MAX_SHARE:
             return self
         thin = list[VerifiedPair]()
-        for pair, kept in zip(self.verified, kept_matches, strict=True):
-            thin.append(replace(pair, matches=pair.matches[kept]))
+        for pair, is_kept in zip(self.verified, best.is_kept, strict=True):
+            thin.append(replace(pair, matches=pair.matches[is_kept]))
         return self._with_pairs(thin, self.cache)
 
     def _with_pairs(

@@ -405,7 +405,12 @@ def _grow_in_order(
 ) -> Generator[pycolmap.Reconstruction | None, None, None]:
     """Yield models that grow from pairs, None of one that makes none.
 
-    They grow in threads after the first, which often is enough.
+    They grow in threads after the first model, which often is enough.
     """
-    yield from map(grower.grow, pairs[:1])
-    yield from map_ordered(grower.grow, pairs[1:], available_cores())
+    num_tried = 0
+    model = None
+    while model is None and num_tried < len(pairs):
+        model = grower.grow(pairs[num_tried])
+        num_tried += 1
+        yield model
+    yield from map_ordered(grower.grow, pairs[num_tried:], available_cores())

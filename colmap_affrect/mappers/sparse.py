@@ -14,7 +14,7 @@ from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
-from colmap_affrect.mappers.final_points import complete_points
+from colmap_affrect.mappers.final_points import complete_points, extract_colors
 from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
@@ -29,6 +29,10 @@ from colmap_affrect.mappers.principal_points import (
     with_shifted_axes,
 )
 from colmap_affrect.mappers.search import Search, with_new_images
+from colmap_affrect.mappers.some_tracks import (
+    large_models,
+    model_of_some_tracks,
+)
 from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
@@ -37,7 +41,6 @@ from colmap_affrect.options import within
 # Others also verify sides that look the same
 MEASURED_PAIRS = "with the pairs of measured frames"
 ALL_PAIRS = "with all pairs"
-SOME_TRACKS = "from some of the tracks"
 AGAIN = "after pairs were matched again"
 PER_IMAGE_CAMERAS = "with a camera for each photograph"
 COLMAP_MODEL = "from COLMAP's model"
@@ -119,17 +122,26 @@ class SparseMapper(IncrementalMapper):
         if task.previous_models:
             found = _restarted(search, task.previous_models)
         else:
-            found = super().map(task, output_path, random_seed, show)
+            by_colmap = partial(
+                super().map,
+                output_path=output_path,
+                random_seed=random_seed,
+                show=show,
+            )
+            thin = graph if task.extend else graph.thinned()
+            found = large_models(task, search, thin, output_path, by_colmap)
             is_whole = found and not graph.unexplained_by(found[0].reconstruction)
             if is_whole and not task.tie_points:
-                return found
+                if thin is graph:  # then they have all points
+                    return found
+                return self._with_last_points(found, task, graph, native)
             found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         best = _joined_by_tie_points(search, search.with_bridges(graph, found))
         if not task.extend:
             return self._with_last_points(best, task, graph, native)
         for mapped in best:
             task.extend.restore(mapped.reconstruction)
-            _extract_colors(mapped.reconstruction, task, native)
+            extract_colors(mapped.reconstruction, task, native)
         return best
 
     def _map_small(
@@ -200,7 +212,7 @@ class SparseMapper(IncrementalMapper):
         def add_last_points(model: pycolmap.Reconstruction) -> None:
             tie_points = tie_points_of(task, graph)
             complete_points(model, graph, native, self.options.noise_px, tie_points)
-            _extract_colors(model, task, native)
+            extract_colors(model, task, native)
 
         return [replace(m, add_last_points=add_last_points) for m in models]
 
@@ -356,7 +368,8 @@ class _HypothesisTest:
         """
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
-            models = _of_some_tracks(self.search, graph) or self.search.best(graph)
+            models = model_of_some_tracks(self.search, graph)
+            models = models or self.search.best(graph)
             return [mapped.first_by(hypothesis.name) for mapped in models]
         if not graph.unexplained_by(self.best[0].reconstruction):
             return []
@@ -483,15 +496,6 @@ class _HypothesisTest:
         return min(found, mapped.motion_share)
 
 
-def _extract_colors(
-    model: pycolmap.Reconstruction,
-    task: MappingTask,
-    native: pycolmap.IncrementalPipelineOptions,
-) -> None:
-    if native.extract_colors and task.image_path:
-        model.extract_colors_for_all_images(task.image_path)
-
-
 def _joined_by_tie_points(
     search: Search, models: Sequence[MappedModel]
 ) -> list[MappedModel]:
@@ -532,21 +536,3 @@ def _with_per_image_cameras(
         if per_image_score <= shared_score + MIN_SCORE_GAIN:
             return None
     return per_image.grower(graph).remake(model)
-
-
-def _of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
-    """Return the model that some tracks of a graph make, with all points, if it is certain."""
-    thin = graph.thinned()
-    if thin is graph:
-        return []
-    scorer = replace(search.scorer, graph=thin)
-    quick = replace(search, scorer=scorer, builds_bridges=False, tries_focals=False)
-    models = quick.best(thin)
-    if not models:
-        return []
-    model = models[0].reconstruction
-    has_all = model.num_reg_images() == len(search.graph.keypoints)
-    if not has_all or not quick.is_certain(model, search.graph):
-        return []
-    search.grower(graph).triangulate_all(model)  # its poses are right
-    return [replace(models[0], hypotheses=(SOME_TRACKS,))]

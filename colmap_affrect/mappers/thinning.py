@@ -4,6 +4,7 @@ Mapping with a part of the tracks takes a fraction of the time.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,11 +12,24 @@ from colmap_affrect.geometry.arrays import Bools, Indices
 
 NUM_TRACKS = 500  # kept of each image (resource: poses are as good as with all)
 NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (resource)
+MAX_SHARE = (
+    0.5  # of the features that are kept, from which on it saves little (resource)
+)
+
+
+@dataclass(frozen=True)
+class BestTracks:
+    """Which matches the best tracks have."""
+
+    is_kept: list[Bools]  # for each pair which of its matches are kept, (M,)
+    share_of_features: (
+        float  # kept of all that have matches: what adjustments take time for
+    )
 
 
 def matches_of_best_tracks(
     pairs: Sequence[tuple[tuple[int, int], Indices]], num_keypoints: Mapping[int, int]
-) -> list[Bools]:
+) -> BestTracks:
     """Choose the matches of the best tracks of each image and of each pair.
 
     Tracks of most images come first, those with two features of one image last, others by chance.
@@ -25,10 +39,10 @@ def matches_of_best_tracks(
         num_keypoints: Number of features by image id.
 
     Returns:
-        For each pair which of its matches are kept, (M,).
+        Their matches.
     """
     if not pairs:
-        return []
+        return BestTracks([], share_of_features=1.0)
     # Features of all images are numbered one after the other; a track has its lowest number.
     image_ids = sorted(num_keypoints)
     counts = [num_keypoints[image_id] for image_id in image_ids]
@@ -50,7 +64,10 @@ def matches_of_best_tracks(
     tracks_of_pairs = [track_of[of_pair[:, 0]] for of_pair in matches]
     for tracks_of_pair in tracks_of_pairs:
         is_kept[_best(tracks_of_pair, ranks, NUM_MATCHES_OF_PAIR)] = True
-    return [is_kept[tracks_of_pair] for tracks_of_pair in tracks_of_pairs]
+    return BestTracks(
+        is_kept=[is_kept[tracks_of_pair] for tracks_of_pair in tracks_of_pairs],
+        share_of_features=float(is_kept[track_of[matched]].mean()),
+    )
 
 
 def _numbered_through(

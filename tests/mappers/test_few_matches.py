@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +22,12 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers import few_matches
-from colmap_affrect.mappers.few_matches import MAX_RAW, _Closures, sure_few_matches
+from colmap_affrect.mappers.few_matches import (
+    MAX_RAW,
+    MIN_INLIER_SHARE,
+    _Closures,
+    sure_few_matches,
+)
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 
@@ -83,6 +90,27 @@ def test_few_matches_drawn_at_random_are_never_sure(tmp_path: Path) -> None:
         change[ids] = np.stack(features, axis=1)
     change_matches(path, change)
     assert sure_ids(path) == set()
+
+
+def test_no_more_samples_are_drawn_than_find_what_is_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    targets(path)
+    shares = set[float]()
+    estimate = pycolmap.estimate_two_view_geometry
+
+    def estimate_and_note(*arguments: Any) -> pycolmap.TwoViewGeometry:
+        shares.add(arguments[-1].ransac.min_inlier_ratio)
+        return estimate(*arguments)
+
+    noted = SimpleNamespace(
+        estimate_two_view_geometry=estimate_and_note,
+        pair_id_to_image_pair=pycolmap.pair_id_to_image_pair,
+    )
+    monkeypatch.setattr(few_matches, "pycolmap", noted)
+    assert len(sure_ids(path)) == 10
+    assert shares == {MIN_INLIER_SHARE}
 
 
 @pytest.mark.parametrize("is_confirmed", [True, False])

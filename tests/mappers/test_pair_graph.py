@@ -3,6 +3,7 @@
 import copy
 from collections import Counter, defaultdict
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.geometry.arrays import rows_in
-from colmap_affrect.mappers import pair_graph
+from colmap_affrect.mappers import pair_graph, sparse
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.incremental import IncrementalMapper
 from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     VerifiedPair,
@@ -24,8 +27,14 @@ from colmap_affrect.mappers.pair_graph import (
     compared_with_pose,
     poses_of,
 )
-from colmap_affrect.mappers.sparse import SOME_TRACKS, SparseMapper, SparseOptions
-from colmap_affrect.mappers.thinning import NUM_MATCHES_OF_PAIR, NUM_TRACKS, _ranks
+from colmap_affrect.mappers.some_tracks import SOME_TRACKS
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
+from colmap_affrect.mappers.thinning import (
+    NUM_MATCHES_OF_PAIR,
+    NUM_TRACKS,
+    _ranks,
+    matches_of_best_tracks,
+)
 
 NUM_IMAGES = 5
 
@@ -64,6 +73,22 @@ def test_tracks_of_most_images_come_first_and_ambiguous_ones_last() -> None:
     assert _ranks(num_features, num_images).tolist() == [2, 3, 1, 0, 4]
 
 
+def test_features_say_how_many_tracks_are_left_out_not_matches() -> None:
+    # 600 tracks of six images, of which 500 are kept, make ten times as many matches as 900 of two.
+    long_tracks = np.repeat(np.arange(600)[:, None], 2, axis=1)
+    pairs = [(ids, long_tracks) for ids in combinations(range(6), 2)]
+    for first in (0, 2, 4):
+        short_tracks = np.repeat(np.arange(600, 1500)[:, None], 2, axis=1)
+        ids = first, first + 1
+        index = [pair for pair, _ in pairs].index(ids)
+        pairs[index] = (ids, np.concatenate([long_tracks, short_tracks]))
+    best = matches_of_best_tracks(pairs, dict.fromkeys(range(6), 1500))
+    assert best.share_of_features == pytest.approx(500 / 1500)
+    num_kept = sum(int(is_kept.sum()) for is_kept in best.is_kept)
+    assert num_kept == len(pairs) * NUM_TRACKS
+    assert num_kept > sum(map(len, best.is_kept)) / 2
+
+
 def test_a_thinned_graph_has_its_tracks_whole(path: Path) -> None:
     graph = PairGraph.read(path)
     thin = graph.thinned()
@@ -84,6 +109,33 @@ def test_a_model_of_some_tracks_gets_the_points_of_all(
     assert len(model_poses(model.reconstruction)) == NUM_IMAGES
     assert model.reconstruction.num_points3D() > 2000
     assert model.hypotheses[-1] == SOME_TRACKS
+
+
+def test_colmap_maps_a_large_set_from_some_of_the_tracks(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sparse, "MIN_LARGE_SET", NUM_IMAGES)
+    task = task_with_given_cameras(path)
+    num_inliers = []
+    by_colmap = IncrementalMapper.map
+
+    def map_and_count(
+        mapper: IncrementalMapper, task: MappingTask, *others: Any, **named: Any
+    ) -> list[MappedModel]:
+        with open_database(task.database_path) as database:
+            num_inliers.append(database.num_inlier_matches())
+        return by_colmap(mapper, task, *others, **named)
+
+    monkeypatch.setattr(IncrementalMapper, "map", map_and_count)
+    (model,) = SparseMapper(SparseOptions()).map(task, tmp_path, 0, lambda _: None)
+    assert model.hypotheses == (SOME_TRACKS,)
+    thin = PairGraph.read(path).thinned()
+    assert num_inliers == [sum(len(pair.matches) for pair in thin.verified)]
+    assert list(tmp_path.glob("**/*.db")) == []
+    num_thin = len(set().union(*features_of_pairs(thin).values()))
+    assert len(model_poses(model.reconstruction)) == NUM_IMAGES
+    assert model.reconstruction.num_points3D() > 2000 > num_thin
+    assert model.add_last_points is not None
 
 
 def test_pairs_leave_a_graph_and_what_the_mappers_see(path: Path) -> None:

@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ from colmap_affrect.mappers.model_score import (
     pair_log_ratio,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of
-from colmap_affrect.mappers.search import Search, _Attempt, first_pairs
+from colmap_affrect.mappers.search import Search, _Attempt, _grow_in_order, first_pairs
 from colmap_affrect.mappers.sparse import COLMAP_MODEL, PER_IMAGE_CAMERAS
 
 TRUE_FOCAL = 1280.0
@@ -576,3 +576,20 @@ def test_known_models_stay_as_they_are_when_they_are_extended(
     found = search.extend_models(search.graph, known)
     assert len(found) >= 2
     assert [focals(mapped.reconstruction) for mapped in known] == before_px
+
+
+def test_models_grow_in_threads_only_where_the_first_one_is_not_enough() -> None:
+    grown = list[int]()
+
+    def grow(pair: tuple[int, int]) -> pycolmap.Reconstruction | None:
+        grown.append(pair[0])
+        return None if pair[0] < 2 else pycolmap.Reconstruction()
+
+    grower = cast(Grower, SimpleNamespace(grow=grow))
+    models = _grow_in_order(grower, [(number, 9) for number in range(6)])
+    assert [next(models), next(models)] == [None, None]
+    assert next(models) is not None
+    models.close()
+    assert grown == [0, 1, 2]
+    every = list(_grow_in_order(grower, [(number, 9) for number in range(6)]))
+    assert [model is None for model in every] == [True] * 2 + [False] * 4
