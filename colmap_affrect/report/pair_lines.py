@@ -53,6 +53,7 @@ def lines_of_pairs(
     known.sort(key=lambda pair: -num_inliers[pair])
     shown = known[:MAX_NUM_PAIRS]
     num_lines = num_lines_of_pair(len(shown))
+    reader.look_up_levels(shown)
     found = PairLines()
     ends = [np.empty((0, 4), dtype="<u2")]
     kinds = [np.empty(0, dtype=np.uint8)]

@@ -1,5 +1,6 @@
 """The matches of a pair of photographs, and what a run knows of each of them."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
@@ -65,20 +66,22 @@ class PairReader:
         # Share of inliers, by verified pair
         self.agreement = agreements(self.graph, self.model)
         self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
+        self._keypoints = lru_cache(NUM_KEPT)(self._read_keypoints)
+        # Of pairs whose matches are stored, those that were looked up
+        self._levels = dict[Pair, int]()
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
+        known = self.graph.ids
         sizes = []
         keypoints = []
+        for name in names:
+            require_known(name, known)
+            camera = self.graph.cameras[name]
+            sizes.append((camera.width, camera.height))
+            keypoints.append(self._keypoints(name))
+        ids = (known[names[0]], known[names[1]])
         with self.graph.open_to_read() as database:
-            images = {image.name: image for image in database.read_all_images()}
-            for name in names:
-                require_known(name, images)
-                camera = database.read_camera(images[name].camera_id)
-                sizes.append((camera.width, camera.height))
-                rows = database.read_keypoints(images[name].image_id)
-                keypoints.append(np.asarray(rows[:, :2], np.float64))
-            ids = (images[names[0]].image_id, images[names[1]].image_id)
             raw = np.asarray(database.read_matches(*ids), np.int64).reshape(-1, 2)
             geometry = database.read_two_view_geometry(*ids)
             is_matched = database.exists_matches(*ids)
@@ -110,6 +113,22 @@ class PairReader:
             ),
             self._text(names, len(raw), len(inliers)),
         )
+
+    def look_up_levels(self, pairs: Iterable[Pair]) -> None:
+        """Read the levels of many pairs together; for each alone a file would be opened.
+
+        There are none of pairs that another program has matched, nor of a store that is damaged.
+        """
+        ordered = [(min(pair), max(pair)) for pair in pairs]
+        if self.run:
+            with suppress(StoreError):
+                self._levels |= self.run.matches.levels_of_stored(ordered)
+
+    def _read_keypoints(self, name: str) -> Array:
+        """Return the (N, 2) px of the keypoints of a photograph, from its upper left corner."""
+        with self.graph.open_to_read() as database:
+            rows = database.read_keypoints(self.graph.ids[name])
+        return np.asarray(rows[:, :2], np.float64)
 
     def _feature_kinds(
         self, names: Pair, keypoints: list[Array], matches: Indices
@@ -163,9 +182,10 @@ class PairReader:
         text = f"{num_raw} raw matches"
         if self.run:
             pair = (min(names), max(names))
-            # Another program has matched the pair, and not the run
-            with suppress(StoreError):
-                level = self.run.matches.levels([pair])[pair]
+            if pair not in self._levels:
+                self.look_up_levels([pair])
+            level = self._levels.get(pair)
+            if level is not None:
                 text += f" of level {level} ({self.run.extraction.levels[level].name})"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))

@@ -136,7 +136,9 @@ class Stores(SimpleNamespace):
     def level_ranges(self, _: str) -> dict[int, range]:
         return {0: range(60), 1: range(60, 1000)}
 
-    def levels(self, asked: list[tuple[str, str]]) -> dict[tuple[str, str], int]:
+    def levels_of_stored(
+        self, asked: list[tuple[str, str]]
+    ) -> dict[tuple[str, str], int]:
         return dict.fromkeys(asked, 1)
 
 
