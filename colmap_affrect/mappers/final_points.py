@@ -89,7 +89,13 @@ def extract_colors(
     task: MappingTask,
     native: pycolmap.IncrementalPipelineOptions,
 ) -> None:
-    """Give points the colours of photographs, where there are some and the options ask for it."""
+    """Give points the colours of photographs, where there are some and the options ask for it.
+
+    Args:
+        model: Changed in place.
+        task: Says where the photographs are.
+        native: The options.
+    """
     if native.extract_colors and task.image_path:
         model.extract_colors_for_all_images(task.image_path)
 

@@ -68,6 +68,11 @@ class Grower:
             MIN_FEW_POINTS, self.options.abs_pose_min_num_inliers
         )
         self.triangulation = native.get_triangulation()
+        self._is_stopped = False
+
+    def stop(self) -> None:
+        """Have models that grow in other threads end with their next image, unfinished."""
+        self._is_stopped = True
 
     @contextmanager
     def _mapping(
@@ -200,6 +205,8 @@ class Grower:
         num_adjusted = model.num_reg_images()
         image_id = self._register_next(mapper)
         while image_id:
+            if self._is_stopped:
+                return
             self._triangulate(mapper, [image_id])
             mapper.complete_and_merge_tracks(self.triangulation)
             num_images = model.num_reg_images()

@@ -405,7 +405,8 @@ def _grow_in_order(
 ) -> Generator[pycolmap.Reconstruction | None, None, None]:
     """Yield models that grow from pairs, None of one that makes none.
 
-    They grow in threads after the first model, which often is enough.
+    They grow in threads after the first model, which often is enough. Those that nobody asks for
+    any more end unfinished.
     """
     num_tried = 0
     model = None
@@ -413,4 +414,10 @@ def _grow_in_order(
         model = grower.grow(pairs[num_tried])
         num_tried += 1
         yield model
-    yield from map_ordered(grower.grow, pairs[num_tried:], available_cores())
+    others = map_ordered(grower.grow, pairs[num_tried:], available_cores())
+    try:
+        for model in others:  # `yield from` would wait for them before it stops them
+            yield model
+    finally:
+        grower.stop()
+        others.close()

@@ -12,9 +12,8 @@ from colmap_affrect.geometry.arrays import Bools, Indices
 
 NUM_TRACKS = 500  # kept of each image (resource: poses are as good as with all)
 NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (resource)
-MAX_SHARE = (
-    0.5  # of the features that are kept, from which on it saves little (resource)
-)
+# Of the features that are kept, from which on it saves little (resource)
+MAX_SHARE = 0.5
 
 
 @dataclass(frozen=True)

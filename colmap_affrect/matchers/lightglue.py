@@ -12,9 +12,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -42,6 +43,8 @@ linear estimate of a fundamental matrix needs eight)."""
 DUPLICATE_RADIUS_PX = 2.0
 """Of matches that are nearer than this in both images the best stays; the radius of a duplicate in
 :class:`.nearest.NearestOptions`; same as NearestOptions.duplicate_radius_px."""
+# Of kornia's block of cross-attention
+CROSS_BLOCK_PARTS = ("to_qk", "to_v", "to_out", "ffn", "heads")
 # Descriptors that are compared at once, which bounds memory; resource
 CHUNK_ROWS = 1 << 10
 
@@ -117,6 +120,8 @@ class LightGlue:
         self._device = resolve_device(context.device)
         (key,) = options.weights
         network = load_network(context.weights[key], options)
+        if self._device.type == "cpu":
+            fuse_cross_attention(network)
         self._network = network.to(self._device)
         self._gpu_lock = threading.Lock()
 
@@ -224,6 +229,56 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
         if name in parameters:
             raise unusable(path, f"{problem} (no {name})")
     return network.eval().requires_grad_(False)
+
+
+def fuse_cross_attention(network: nn.Module) -> None:
+    """Have LightGlue attend from image to image by torch's fused attention, on a CPU, too.
+
+    kornia does so on GPUs alone. Elsewhere it holds the similarities of all pairs of features, for
+    which more than half of the time of a pair of images goes. Results are the same to rounding.
+
+    Args:
+        network: kornia's; changed in place, where its blocks have the parts that are known.
+    """
+    for layer in network.transformers:  # type: ignore[union-attr]
+        block = layer.cross_attn
+        if all(hasattr(block, part) for part in CROSS_BLOCK_PARTS):
+            block.forward = partial(_attend_across, block)
+
+
+def _attend_across(block: Any, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Do what the forward of kornia's ``CrossBlock`` does.
+
+    Args:
+        block: kornia's.
+        first: (B, N, D) descriptors of image 1.
+        second: (B, M, D) descriptors of image 2.
+
+    Returns:
+        Both with what they have learned of each other, (B, N, D) and (B, M, D).
+    """
+    import torch
+    from torch.nn.functional import scaled_dot_product_attention
+
+    keys = [_by_head(block.to_qk(x), block.heads) for x in (first, second)]
+    values = [_by_head(block.to_v(x), block.heads) for x in (first, second)]
+    told = [
+        scaled_dot_product_attention(keys[0], keys[1], values[1]),
+        scaled_dot_product_attention(keys[1], keys[0], values[0]),
+    ]
+    found = []
+    for descriptors, message in zip((first, second), told, strict=True):
+        merged = block.to_out(message.transpose(1, 2).flatten(start_dim=-2))
+        change = block.ffn(torch.cat([descriptors, merged], -1))
+        found.append(descriptors + change)
+    return found[0], found[1]
+
+
+def _by_head(descriptors: Tensor, num_heads: int) -> Tensor:
+    """Return (B, N, D) descriptors as (B, H, N, D / H)."""
+    size, number, _ = descriptors.shape
+    parts = descriptors.reshape(size, number, num_heads, -1)
+    return parts.transpose(1, 2).contiguous()
 
 
 def kornia_name(name: str) -> str:

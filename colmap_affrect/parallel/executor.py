@@ -122,7 +122,7 @@ def one_openmp_thread() -> Iterator[None]:
 
 def map_ordered(
     function: Callable[[Task], Result], tasks: Iterable[Task], num_threads: int
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """Yield the results of tasks in their order; at most two tasks per thread are in flight.
 
     Meanwhile numpy's linear algebra keeps to the calling thread, and OpenCV to its share of the

@@ -49,6 +49,20 @@ def grower_of(path: Path, init_min_num_inliers: int = 1) -> Grower:
     return Grower(graph, adjuster, native, lambda _: None)
 
 
+def test_a_stopped_model_takes_no_more_images(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db", num_rigs=4, num_points3D=150)
+    grower = grower_of(tmp_path / "database.db")
+    grown = {pair.ids: grower.grow(pair.ids) for pair in grower.graph.pairs}
+    first = next(ids for ids, model in grown.items() if model)
+    whole = grown[first]
+    assert whole is not None
+    assert whole.num_reg_images() == 4
+    grower.stop()
+    stopped = grower.grow(first)
+    assert stopped is not None
+    assert stopped.num_reg_images() == 3  # its next image is the last one
+
+
 def test_all_is_adjusted_after_each_of_ten_images_and_then_as_the_model_grows(
     tmp_path: Path,
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
+import threading
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -585,7 +586,7 @@ def test_models_grow_in_threads_only_where_the_first_one_is_not_enough() -> None
         grown.append(pair[0])
         return None if pair[0] < 2 else pycolmap.Reconstruction()
 
-    grower = cast(Grower, SimpleNamespace(grow=grow))
+    grower = cast(Grower, SimpleNamespace(grow=grow, stop=lambda: None))
     models = _grow_in_order(grower, [(number, 9) for number in range(6)])
     assert [next(models), next(models)] == [None, None]
     assert next(models) is not None
@@ -593,3 +594,22 @@ def test_models_grow_in_threads_only_where_the_first_one_is_not_enough() -> None
     assert grown == [0, 1, 2]
     every = list(_grow_in_order(grower, [(number, 9) for number in range(6)]))
     assert [model is None for model in every] == [True] * 2 + [False] * 4
+
+
+def test_models_that_nobody_waits_for_end_with_their_next_image() -> None:
+    is_stopped = threading.Event()
+    have_begun = threading.Semaphore(0)
+
+    def grow(pair: tuple[int, int]) -> pycolmap.Reconstruction:
+        if pair[0] > 1:
+            have_begun.release()
+            assert is_stopped.wait(timeout=10.0)
+        return pycolmap.Reconstruction()
+
+    grower = cast(Grower, SimpleNamespace(grow=grow, stop=is_stopped.set))
+    models = _grow_in_order(grower, [(number, 9) for number in range(4)])
+    next(models)
+    next(models)
+    assert have_begun.acquire(timeout=10.0)
+    models.close()  # would wait for ever for a model that grows on
+    assert is_stopped.is_set()

@@ -6,6 +6,8 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     LightGlue,
     LightGlueOptions,
+    fuse_cross_attention,
     load_network,
     merged_matches,
     network_inputs,
@@ -163,6 +166,30 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
     for one, other in zip(alone, together, strict=True):
         assert_array_equal(one.indices, other.indices)
         assert_array_equal(one.scores, other.scores)
+
+
+def test_fused_attention_tells_each_image_what_kornia_tells_it() -> None:
+    from kornia.feature.lightglue import CrossBlock
+
+    torch.manual_seed(0)
+    block = CrossBlock(embed_dim=64, num_heads=2).eval()
+    first = torch.randn(1, 11, 64)
+    second = torch.randn(1, 5, 64)
+    expected = block(first, second)
+    network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
+    fuse_cross_attention(cast(torch.nn.Module, network))
+    fused = block(first, second)
+    assert block.forward is not type(block).forward
+    for found, known, before in zip(fused, expected, (first, second), strict=True):
+        torch.testing.assert_close(found, known, atol=1e-5, rtol=1e-5)
+        assert (found - before).abs().max() > 0.1
+
+
+def test_another_network_of_kornia_stays_as_it_is() -> None:
+    block = torch.nn.Linear(3, 3)
+    network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
+    fuse_cross_attention(cast(torch.nn.Module, network))
+    assert "forward" not in vars(block)
 
 
 def test_features_of_another_extractor_are_refused_in_one_line(

@@ -1,0 +1,106 @@
+"""Models of some of the tracks, which tell poses as well as all do, with the points of all.
+
+Mapping with a part of the tracks takes a fraction of the time: see
+:mod:`colmap_affrect.mappers.thinning`.
+"""
+
+import copy
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.search import Search
+
+SOME_TRACKS = "from some of the tracks"  # what made a model, in the words of a report
+
+
+def model_of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
+    """Return the model that some tracks of a graph make, with all points, if it is certain.
+
+    Args:
+        search: Makes and scores models.
+        graph: The pairs that a model is made from.
+
+    Returns:
+        One model, or none.
+    """
+    thin = graph.thinned()
+    if thin is graph:
+        return []
+    scorer = replace(search.scorer, graph=thin)
+    quick = replace(search, scorer=scorer, builds_bridges=False, tries_focals=False)
+    models = quick.best(thin)
+    if not models:
+        return []
+    model = models[0].reconstruction
+    has_all = model.num_reg_images() == len(search.graph.keypoints)
+    if not has_all or not quick.is_certain(model, search.graph):
+        return []
+    return [_with_all_points(search, graph, models[0])]
+
+
+def large_models(
+    task: MappingTask,
+    search: Search,
+    thin: PairGraph,
+    folder: Path,
+    map_task: Callable[[MappingTask], list[MappedModel]],
+) -> list[MappedModel]:
+    """Return the models that another mapper makes, with the points of all tracks.
+
+    Args:
+        task: What to map.
+        search: Has the graph of all tracks, and adjusts models with them.
+        thin: That graph with some of its tracks, or itself.
+        folder: Where files may be while the mapper runs.
+        map_task: Maps a task by the other mapper.
+    """
+    if thin is search.graph:
+        return map_task(task)
+    with _with_thin_database(task, thin, folder) as some:
+        models = map_task(some)
+    if not models:
+        return map_task(task)
+    return [_with_all_points(search, search.graph, mapped) for mapped in models]
+
+
+def _with_all_points(
+    search: Search, graph: PairGraph, mapped: MappedModel
+) -> MappedModel:
+    """Give a model made from some tracks of a graph the points of all of them; it is changed."""
+    search.grower(graph).triangulate_all(mapped.reconstruction)  # its poses are right
+    return replace(mapped, hypotheses=(SOME_TRACKS,))
+
+
+@contextmanager
+def _with_thin_database(
+    task: MappingTask, thin: PairGraph, folder: Path
+) -> Iterator[MappingTask]:
+    """Give a task a database that has the inliers of a thinned graph alone, and no photographs.
+
+    Args:
+        task: What to map.
+        thin: The graph.
+        folder: Where the database is while it is mapped.
+    """
+
+    def write_inliers(database: pycolmap.Database) -> None:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+        for pair in thin.verified:
+            geometry = copy.copy(pair.geometry)
+            geometry.inlier_matches = pair.matches.astype(np.uint32)
+            database.write_two_view_geometry(*pair.ids, geometry)
+
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        path = Path(name) / "database.db"
+        copy_database(task.database_path, path, change=write_inliers)
+        yield replace(task, database_path=path, image_path=None)
