@@ -244,7 +244,19 @@ def read_pairs(
 def read_pairs_once(
     path: Path, names: Sequence[str], image_path: Path | None = None
 ) -> PairList:
-    """Return a pair list as :func:`read_pairs`, read once while size and times stay as they are."""
+    """Return a pair list, read once while its size and times stay as they are.
+
+    Args:
+        path: the list.
+        names: as for :func:`read_pairs`.
+        image_path: as for :func:`read_pairs`.
+
+    Returns:
+        The pairs, sorted.
+
+    Raises:
+        AffrectError: as :func:`read_pairs` does.
+    """
     return _read_once(path, stamp_of([path]), tuple(names), image_path)
 
 

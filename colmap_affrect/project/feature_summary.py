@@ -5,6 +5,7 @@ the size and times that it names, and is left out where it is damaged. Whoever c
 ``features.h5`` removes it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import TypeAdapter
 
-from colmap_affrect import __version__
 from colmap_affrect.geometry.lines import LineCamera, LineFindings, upright_of
 from colmap_affrect.project.record import Content
 from colmap_affrect.project.sealed_json import read_sealed, write_sealed
@@ -43,16 +43,15 @@ class _Row(NamedTuple):
 
 @dataclass(frozen=True)
 class _Table:
-    made_by: str
+    format_version: int
     stamp: str
     images: dict[str, _Row]
 
 
 TABLE_JSON = TypeAdapter(_Table)
 NUM_CAMERA_VALUES = 13  # format
-# Counts up when the same features give other summaries; format
+# Counts up when the same features give other summaries, as by other priors of lines; format
 FORMAT_VERSION = 1
-MADE_BY = f"colmap-affrect {__version__}, {FORMAT_VERSION}"
 
 
 def summary_path(features_path: Path) -> Path:
@@ -70,9 +69,10 @@ def read_summaries(features_path: Path, stamp: str) -> dict[str, ImageSummary] |
     Returns:
         Summaries by name; None where there is no file, or one that is damaged or of other features.
     """
+    expected = (FORMAT_VERSION, stamp)
     try:
         values = read_sealed(summary_path(features_path))
-        if (values.get("made_by"), values.get("stamp")) != (MADE_BY, stamp):
+        if (values.get("format_version"), values.get("stamp")) != expected:
             return None
         found = {}
         for name, row in TABLE_JSON.validate_python(values).images.items():
@@ -82,13 +82,13 @@ def read_summaries(features_path: Path, stamp: str) -> dict[str, ImageSummary] |
                 image_size=row.image_size,
                 lines=_findings_of(row.lines) if row.lines else None,
             )
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return found
 
 
 def write_summaries(
-    features_path: Path, stamp: str, summaries: dict[str, ImageSummary]
+    features_path: Path, stamp: str, summaries: Mapping[str, ImageSummary]
 ) -> None:
     """Write what is known of each photograph.
 
@@ -108,7 +108,7 @@ def write_summaries(
             image_size=summary.image_size,
             lines=_line_row(summary.lines) if summary.lines else None,
         )
-    content = TABLE_JSON.dump_json(_Table(MADE_BY, stamp, rows))
+    content = TABLE_JSON.dump_json(_Table(FORMAT_VERSION, stamp, rows))
     write_sealed(summary_path(features_path), content)
 
 

@@ -87,11 +87,7 @@ def extract(
     if contents != known:  # those that were there before were seen to be good
         warned += inputs.check_names(names)
     without_mask = _mask_warnings(inputs, names)
-    extractor = None
-    if _names_to_extract(known, contents):
-        extractor = one_image.prepare(
-            recipe.extraction, context.resources, names, context.progress
-        )
+    extractor = _prepared(context, recipe, known, contents)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
     _record(context, inputs, recipe, later=later or {}, overwrite=overwrite)
@@ -104,12 +100,9 @@ def extract(
         warned += _warnings_of_the_folder(inputs, names)
     warned += without_mask
     _log_warnings(warned)
-    failures = dict[str, ImageFailure]()
-    warned_of_images = list[StageWarning]()
-    if extractor:
-        failures, warned_of_images = _extract_missing(
-            context, inputs, extractor, names=missing, contents=contents
-        )
+    failures, warned_of_images = _extract_missing(
+        context, inputs, extractor, names=missing, contents=contents
+    )
     _require_one_usable(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
@@ -119,6 +112,27 @@ def extract(
         num_kept=len(done - failures.keys()),
         failed=failures,
         warned=(*warned, *warned_of_images),
+    )
+
+
+def _prepared(
+    context: Context,
+    recipe: Recipe,
+    known: Mapping[str, Content],
+    now: Mapping[str, Content],
+) -> ImageExtractor | None:
+    """Return what extracts features; None where nothing is to do, and no networks are loaded.
+
+    Args:
+        context: of the workspace.
+        recipe: says which features.
+        known: what the files held that features are from, by image.
+        now: what the files hold, by image.
+    """
+    if known.keys() >= now.keys() and not _changed(known, now):
+        return None
+    return one_image.prepare(
+        recipe.extraction, context.resources, list(now), context.progress
     )
 
 
@@ -214,11 +228,13 @@ def _log_warnings(warned: Iterable[StageWarning]) -> None:
 def _extract_missing(
     context: Context,
     inputs: Inputs,
-    extractor: ImageExtractor,
+    extractor: ImageExtractor | None,
     names: Sequence[str],
     contents: Mapping[str, Content],
 ) -> tuple[dict[str, ImageFailure], list[StageWarning]]:
     """Extract images one by one; return why some cannot be used, and warnings of others."""
+    if not extractor:
+        return {}, []
     store = context.features
     images = [(name, 0) for name in names]
     failures = dict[str, ImageFailure]()
@@ -383,19 +399,6 @@ def _refuse_other_photographs(
                 Option("output-path"),
             ),
         )
-
-
-def _names_to_extract(
-    known: Mapping[str, Content], now: Mapping[str, Content]
-) -> list[str]:
-    """Return the images that have no features, or those of other files.
-
-    Args:
-        known: what the files held that features are from, by image.
-        now: what the files hold, by image.
-    """
-    changed = set(_changed(known, now))
-    return [name for name in now if name not in known or name in changed]
 
 
 def _changed(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:

@@ -120,7 +120,7 @@ def test_summaries_that_are_damaged_or_of_another_version_do_not_count(
     elif damage == "end":
         path.write_text(text[:-40], encoding="utf-8")
     elif damage == "version":
-        monkeypatch.setattr(feature_summary, "MADE_BY", "colmap-affrect 0.0, 0")
+        monkeypatch.setattr(feature_summary, "FORMAT_VERSION", 0)
     elif damage == "camera":
         values["images"][NAMES[0]][3][2].pop()
         write_sealed(path, json.dumps(values))
