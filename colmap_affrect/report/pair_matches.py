@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -69,6 +69,12 @@ class PairReader:
         self._keypoints = lru_cache(NUM_KEPT)(self._read_keypoints)
         # Of pairs whose matches are stored, those that were looked up
         self._levels = dict[Pair, int]()
+
+    @cached_property
+    def _recipe_levels(self) -> list[tuple[str, bool]]:
+        """Name of each level of the recipe on record, and whether its features have shapes."""
+        levels = self.run.extraction.levels if self.run else ()
+        return [(level.name, level.features.has_shapes) for level in levels]
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
@@ -155,7 +161,8 @@ class PairReader:
         ids = self.run.features.read_rectification_ids(name)
         kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
         for level, rows in self.run.features.level_ranges(name).items():
-            if not self.run.extraction.levels[level].features.has_shapes:
+            _, has_shapes = self._recipe_levels[level]
+            if not has_shapes:
                 kinds[rows.start : rows.stop] = MatchKind.LEARNED
         return kinds
 
@@ -186,7 +193,8 @@ class PairReader:
                 self.look_up_levels([pair])
             level = self._levels.get(pair)
             if level is not None:
-                text += f" of level {level} ({self.run.extraction.levels[level].name})"
+                name, _ = self._recipe_levels[level]
+                text += f" of level {level} ({name})"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))
         if share is not None:
