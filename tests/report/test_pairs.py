@@ -8,10 +8,11 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,10 +31,15 @@ from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
-from colmap_affrect.report.pair_lines import MAX_NUM_PAIRS, num_lines_of_pair
+from colmap_affrect.report.pair_lines import (
+    MAX_NUM_PAIRS,
+    lines_of_pairs,
+    num_lines_of_pair,
+)
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
+from colmap_affrect.session import view_graph
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
@@ -340,3 +346,17 @@ def test_a_page_draws_each_pair_and_fewer_lines_of_each_where_there_are_many() -
     assert num_lines_of_pair(780) == 30
     assert num_lines_of_pair(MAX_NUM_PAIRS) == 20
     assert MAX_NUM_PAIRS >= 100 * 99 / 2
+
+
+def test_images_are_read_once_for_all_pairs_and_levels_together(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stores: Any = Stores(scene, ["match"])
+    levels = Mock(wraps=stores.levels_of_stored)
+    monkeypatch.setattr(stores, "levels_of_stored", levels)
+    images = Mock(wraps=view_graph._read_images)
+    monkeypatch.setattr(view_graph, "_read_images", images)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
+    found = lines_of_pairs(reader, NAMES, dict.fromkeys(combinations(NAMES, 2), 30))
+    assert len(found.pairs) == 15
+    assert (images.call_count, levels.call_count) == (1, 1)
