@@ -8,10 +8,15 @@ from collections.abc import Callable
 COSTS = {"extract": 1.0, "match": 0.2, "verify": 0.08, "map": 0.7}
 """Of an image or a pair in a stage, in the time of an image in ``extract``: measured on runs
 of 8 to 1000 photographs, good for a factor of 2."""
+LOADING_CORE_S = 1.5
+"""Until the first photograph is worked on: packages and files of weights;
+measured there, 1.5 to 1.6 on six sets."""
+MAP_CORE_S = 0.3
+"""Of an image in ``map``, whatever its size; measured there, 0.1 to 0.7 on small sets."""
 CORE_S_PER_MEGAPIXEL = 1.5
 """Of ``extract``, at the size of processing; measured there: 1.2 to 1.8 on five sets."""
 LEARNED_COSTS = {"image": 1.25, "pair": 2.15}
-"""Of learned matching, in the same unit: measured there, 0.7 to 1.3 times that on two sets."""
+"""Of learned matching, in the same unit: measured there, 0.5 to 1.7 times that on four sets."""
 AFTER_FIRST_MODEL = ("escalate", "pictures")
 """Stages that follow the first model."""
 AFTER_SHARE = 1.0
@@ -21,8 +26,8 @@ of both, only it can tell."""
 FACTOR = 2.0  # that a forecast may be off; where it may be more, two are told; display
 GOES_ON_SHARE = 0.5
 """Of the time that mapping took already: hypotheses after the last image; measured there."""
-LIKELY_SHARE = 0.5  # of the time that all steps may take at most: most help; measured
-# Of a run: before, it has loaded files and networks, and says too little; display
+LIKELY_SHARE = 0.5  # of the time that all steps may still take: most help; measured
+# Of a run of whose photographs nothing is known: before, it says too little; display
 MIN_ELAPSED_S = 3.0
 # Units after the first ones that tell how fast a stage is; display
 MIN_NUM_MEASURED = 2
@@ -42,6 +47,7 @@ class Forecast:
         goes_on: bool = True,
         megapixels: float = 0.0,
         num_cores: int = 1,
+        is_new: bool = True,
     ) -> None:
         """Take what is ahead if all images are new.
 
@@ -54,6 +60,8 @@ class Forecast:
             megapixels: of all photographs at the size of processing, by which a run is forecast
                 until something is measured; 0: it is not.
             num_cores: that work at once.
+            is_new: whether nothing of the run is there already: else the first stage tells how
+                much is left.
         """
         self._expected_unit_s = 0.0  # of a unit of cost, until something is measured
         if num_images:
@@ -61,6 +69,7 @@ class Forecast:
             self._expected_unit_s = core_s / num_images / max(1, num_cores)
         self._num_cores = max(1, num_cores)
         self._goes_on = goes_on
+        self._is_new = is_new
         self._learned_cost = 0.0
         if num_learned_pairs:
             self._learned_cost = LEARNED_COSTS["image"] * num_images
@@ -69,8 +78,7 @@ class Forecast:
             "extract": COSTS["extract"] * num_images,
             "match": COSTS["match"] * num_pairs,
             "verify": COSTS["verify"] * num_pairs,
-            # Adjustments grow with the model.
-            "map": COSTS["map"] * (num_images + num_images**2 // 50),
+            "map": self._cost_of_map(num_images),
         }
         """Costs of the stages until the first model that have not begun."""
         self._clock = clock
@@ -79,10 +87,23 @@ class Forecast:
         self._stage = _RunningStage(0.0, 0, clock())
         self._name = ""  # of the stage
         self._is_first_model = True  # that is being made
+        self._is_learned_matching = False  # that is at work
         self._done_cost = 0.0  # of the stages that have a cost and have ended
         self._done_s = 0.0  # that they took
         self._limit_s = 0.0  # of all that may follow the first model
         self._limit_told_s = clock()
+
+    def _cost_of_map(self, num_images: int) -> float:
+        """Return what mapping costs, in the time of an image in ``extract``.
+
+        Adjustments grow with the model. What else an image takes does not hang on its size, which
+        is known where a run is forecast by its megapixels.
+        """
+        adjusting = COSTS["map"] * (num_images**2 // 50)
+        if not self._expected_unit_s:
+            return COSTS["map"] * num_images + adjusting
+        core_s = self._expected_unit_s * self._num_cores
+        return MAP_CORE_S / core_s * num_images + adjusting
 
     def begin(self, name: str, total: int, part: str = "") -> None:
         """Take note that a stage begins.
@@ -102,10 +123,12 @@ class Forecast:
             unit_cost = known / max(total, 1)
         self._stage = _RunningStage(unit_cost * total, total, self._clock())
         is_after = name in AFTER_FIRST_MODEL
+        self._is_learned_matching = False
         if is_after and self._is_first_model:
             self._is_first_model = False
             self._ahead.clear()
             if total and name != "pictures":
+                self._is_learned_matching = bool(self._learned_cost)
                 self._stage = _RunningStage(self._learned_cost, total, self._clock())
 
     def advance(self, num_done: int) -> None:
@@ -130,12 +153,12 @@ class Forecast:
         """Return the seconds that are left if nothing follows the first model, and if all does."""
         now_s = self._clock()
         here_s = self._left_of_stage_s(now_s)
-        if here_s is None or now_s - self._run_began_s < MIN_ELAPSED_S:
-            return None
         if not self._is_first_model:
-            passed_s = now_s - self._limit_told_s
-            left_s = max(here_s, LIKELY_SHARE * self._limit_s - passed_s)
-            return left_s, left_s
+            return self._least_and_most_of_steps_s(here_s, now_s)
+        if here_s is None:
+            return None
+        if not self._expected_unit_s and now_s - self._run_began_s < MIN_ELAPSED_S:
+            return None
         pace = self._pace(now_s)
         least_s = here_s + pace * sum(self._ahead.values())
         if not self._goes_on:
@@ -145,8 +168,26 @@ class Forecast:
             after_s = AFTER_SHARE * (now_s - self._work_began_s + least_s)
         return least_s, least_s + after_s
 
+    def _least_and_most_of_steps_s(
+        self, here_s: float | None, now_s: float
+    ) -> tuple[float, float] | None:
+        """Return the seconds that are left after the first model.
+
+        Whether steps follow learned matching, only what it finds can tell.
+        """
+        if here_s is None and not self._limit_s:
+            return None
+        known_s = here_s or 0.0
+        if self._is_learned_matching:
+            return known_s, known_s + LIKELY_SHARE * self._limit_s
+        passed_s = now_s - self._limit_told_s
+        left_s = max(known_s, LIKELY_SHARE * (self._limit_s - passed_s))
+        return left_s, left_s
+
     def _left_of_stage_s(self, now_s: float) -> float | None:
         """Return the seconds that are left of the stage; None while nobody knows."""
+        if not self._name:
+            return self._left_of_loading_s(now_s)
         here_s = self._stage.left_s(now_s)
         if here_s is None and self._stage.cost:
             here_s = self._left_by_cost_s(now_s)
@@ -155,6 +196,12 @@ class Forecast:
         if here_s is not None and self._name == "map":
             here_s = max(here_s, self._left_of_map_s(now_s))
         return here_s
+
+    def _left_of_loading_s(self, now_s: float) -> float | None:
+        """Return how long it takes until the first stage begins; None where nobody knows."""
+        if not self._expected_unit_s or not self._is_new:
+            return None
+        return max(0.0, LOADING_CORE_S - (now_s - self._run_began_s))
 
     def _expected_left_s(self, now_s: float) -> float | None:
         """Return how long a stage takes of which nothing is done; None where nobody knows."""
@@ -165,8 +212,8 @@ class Forecast:
 
     def _expected_stage_s(self, elapsed_s: float) -> float:
         """Return how long a stage takes: what cores work on has taken all of the time until now."""
-        num_cores = min(self._num_cores, self._stage.total)
-        at_least_s = elapsed_s * self._stage.total / max(1, num_cores)
+        num_begun = min(os.cpu_count() or 1, self._stage.total)
+        at_least_s = elapsed_s * self._stage.total / max(1, num_begun)
         return max(self._expected_unit_s * self._stage.cost, at_least_s)
 
     def _left_of_map_s(self, now_s: float) -> float:

@@ -152,11 +152,21 @@ def _speak_meanwhile(began_s: float, wait: Callable[[float], bool]) -> None:
     threading.Thread(target=speak, daemon=True).start()
 
 
-def _end_speaking(began_s: float) -> None:
-    """Say that packages are loaded, where that has taken long: the command speaks after seconds."""
+def _end_speaking(began_s: float) -> float:
+    """Say that packages are loaded, where that has taken long: the command speaks after seconds.
+
+    Args:
+        began_s: when the process began, of the monotonic clock.
+
+    Returns:
+        For how many seconds nothing was said.
+    """
     passed_s = time.monotonic() - began_s
-    if passed_s >= QUIET_S and not _is_quiet():
+    if passed_s < QUIET_S:
+        return passed_s
+    if not _is_quiet():
         say(LOADED.format(seconds=passed_s))
+    return 0.0
 
 
 def _is_quiet() -> bool:
@@ -279,15 +289,16 @@ def _work(began_s: float, tell_begin: Callable[[], None] | None = None) -> NoRet
     is_loaded = threading.Event()
     code: int | str | None
 
-    def begin() -> None:
+    def begin() -> float:
         # What has been loaded stays: nothing of it is to be looked for garbage.
         gc.freeze()
         gc.enable()
         is_loaded.set()
         if tell_begin:
             tell_begin()
-        _end_speaking(began_s)
+        waited_s = _end_speaking(began_s)
         _handle(interrupts.raise_first)
+        return waited_s
 
     for stream in (sys.stdout, sys.stderr):
         escape_what_lacks(stream)

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TextIO
 
 from tqdm import tqdm
@@ -29,6 +29,7 @@ class Voice:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.doing = "beginning"
         self.is_listened_to = False  # something speaks where nothing else does
+        self.forecast: Forecast | None = None  # of the run that is at work
         self._clock = clock
         self._heard_s = clock()  # when something was shown last
         self._since_s = (
@@ -36,10 +37,15 @@ class Voice:
         )  # when what is done last showed something of its own
         self._quiet_s = QUIET_S
 
-    def heard(self, doing: str) -> None:
-        """Something was shown."""
+    def heard(self, doing: str, ago_s: float = 0.0) -> None:
+        """Something was shown, or a person began to wait.
+
+        Args:
+            doing: what is done.
+            ago_s: seconds since then.
+        """
         self.doing = doing
-        self._heard_s = self._clock()
+        self._heard_s = self._clock() - ago_s
         self._since_s = self._heard_s
         self._quiet_s = QUIET_S
 
@@ -57,7 +63,9 @@ class Voice:
         if stays:
             silent_s = now_s - self._since_s
             self._quiet_s = min(max(QUIET_S, silent_s), LONGEST_QUIET_S)
-        return f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
+        text = f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
+        left = self.forecast.text() if self.forecast else ""
+        return f"{text}, {left}" if left else text
 
 
 @dataclass(eq=False)
@@ -95,6 +103,11 @@ class Progress:
         shown = cls(sys.stderr)
         is_wanted = shown.takes_bars if progress is None else progress
         return shown if is_wanted else SILENT
+
+    def with_forecast(self, forecast: Forecast) -> "Progress":
+        """Return the same progress that says how long all stages still take."""
+        self.voice.forecast = forecast
+        return replace(self, forecast=forecast)
 
     @property
     def takes_bars(self) -> bool:
@@ -195,13 +208,14 @@ class Progress:
 
     @contextmanager
     def never_silent(
-        self, doing: str = "beginning", interval_s: float = 1.0
+        self, doing: str = "beginning", interval_s: float = 1.0, waited_s: float = 0.0
     ) -> Iterator[None]:
         """Say that the work goes on, for as long as the context lasts and nothing else speaks.
 
         Args:
             doing: what is done, until a stage begins; inside of another such context that one's.
             interval_s: how often to see whether something was said, seconds.
+            waited_s: how long a person has waited already.
         """
         stream = self.stream
         voice = self.voice
@@ -210,7 +224,7 @@ class Progress:
             return
         is_over = threading.Event()
         replaces = self.takes_bars
-        voice.heard(f"{self.title}{doing}")
+        voice.heard(f"{self.title}{doing}", waited_s)
         voice.is_listened_to = True
 
         def listen() -> None:

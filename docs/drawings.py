@@ -16,6 +16,7 @@ def main() -> None:
     write("pixels", 620, 230, pixels())
     write("words", 620, 300, words())
     write("cluster", 620, 220, cluster())
+    write("stages", 760, 200, stages())
     write("own-set", 700, 130, chain(OWN_SET))
     write("release", 700, 130, chain(RELEASE))
 
@@ -118,6 +119,39 @@ def cluster() -> list[str]:
         parts += arrow((180, 105), (260, top + 22))
         parts += arrow((400, top + 22), (470, 105))
     return [*parts, *box(470, 70, (140, 70), ("photographs,", "read by all"))]
+
+
+STAGES = (
+    ("extract", "features"),
+    ("pairs", "to match"),
+    ("match", "features"),
+    ("verify", "and guide"),
+    ("map", "models"),
+)
+
+
+def stages() -> list[str]:
+    """Draw the chain of stages, and the way back for photographs in need."""
+    parts = []
+    for number, rows in enumerate(STAGES):
+        left = 20 + 150 * number
+        parts += box(left, 30, (110, 60), rows)
+        if number:
+            parts += arrow((left - 40, 60), (left, 60))
+    parts += [
+        line((675, 90), (675, 150), ORANGE),
+        line((675, 150), (375, 150), ORANGE),
+        line((375, 150), (375, 100), ORANGE),
+        f"<path d='M370 100 L375 91 L380 100 z' fill='{ORANGE}'/>",
+        text(
+            525,
+            172,
+            "escalation: photographs in need are matched again",
+            ORANGE,
+            "middle",
+        ),
+    ]
+    return parts
 
 
 OWN_SET = (

@@ -16,7 +16,7 @@ from colmap_affrect.project.report import Advice, Bridge, ModelSummary
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.pair_lines import lines_of_pairs
+from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import PairPicture
 from colmap_affrect.report.photographs import photographs_of_report
@@ -113,7 +113,7 @@ def make_run_page(folder: Path) -> Path:
     pair = PairPicture(
         names=NAMES[:2],
         why=f"{NAMES[0]} is doubtful; guided",
-        text="120 raw matches of level 0 (dense-shapes), 60 inliers",
+        text="120 matches by dense-shapes, 60 inliers",
         option=f"--reject-pair '{NAMES[0]},{NAMES[1]}'",
         picture=Picture.from_image(np.zeros((450, 900, 3), np.uint8)),
     )
@@ -123,12 +123,15 @@ def make_run_page(folder: Path) -> Path:
     photographs = photographs_of_report(
         workspace, NAMES, report.models, report.cameras, {}
     )
+    lines = LinesOfRun(reader, NAMES, pairs)
     content = RunContent(
         NAMES,
         pairs,
         photographs_path,
         pairs_to_check=[pair] * 3,
-        pair_lines=lines_of_pairs(reader, NAMES, pairs),
+        pair_lines=lines.of_page(),
+        pair_files=lines.write_files(workspace),
+        num_pairs_left_out=lines.num_left_out,
         cameras=graph.cameras,
     )
     return write_run_page(workspace, replace(report, photographs=photographs), content)

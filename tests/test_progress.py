@@ -15,6 +15,9 @@ from colmap_affrect.forecast import (
     COSTS,
     GOES_ON_SHARE,
     LEARNED_COSTS,
+    LIKELY_SHARE,
+    LOADING_CORE_S,
+    MAP_CORE_S,
     MIN_ELAPSED_S,
     Forecast,
 )
@@ -124,6 +127,59 @@ def test_learned_matching_has_its_own_cost_and_two_forecasts_are_told() -> None:
     assert forecast.least_and_most_s() == pytest.approx((learned_s, learned_s))
 
 
+def test_what_may_follow_learned_matching_is_told_while_it_is_at_work() -> None:
+    """It often finds all; where it finds nothing, steps go on, for at most as long as is told."""
+    clock = Clock()
+    forecast = Forecast(10, 45, clock, num_learned_pairs=45)
+    run_stage(clock, forecast, "extract", 10, 2.0)
+    forecast.expect(400.0)
+    forecast.begin("escalate", 55, "aliked")
+    learned_s = 2.0 * (10 * LEARNED_COSTS["image"] + 45 * LEARNED_COSTS["pair"])
+    most_s = learned_s + LIKELY_SHARE * 400.0
+    assert forecast.least_and_most_s() == pytest.approx((learned_s, most_s))
+    forecast.begin("escalate", 6, "more warps")  # nothing of it is done
+    left_s = LIKELY_SHARE * 400.0
+    assert forecast.least_and_most_s() == pytest.approx((left_s, left_s))
+    forecast.expect(0.0)
+    forecast.begin("guide", 6)
+    assert forecast.least_and_most_s() is None
+
+
+def test_a_run_of_unknown_photographs_is_forecast_when_it_has_lasted_a_while() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 45, clock)
+    assert forecast.left_s() is None
+    forecast.begin("extract", 10)
+    clock.now_s += MIN_ELAPSED_S / 2
+    forecast.advance(1)
+    assert forecast.left_s() is None
+    clock.now_s += MIN_ELAPSED_S
+    forecast.advance(2)
+    assert forecast.left_s() is not None
+
+
+def test_a_run_that_goes_on_is_forecast_when_it_is_known_what_is_left() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 0, clock, goes_on=False, megapixels=20.0, is_new=False)
+    assert forecast.left_s() is None
+    forecast.begin("extract", 1)
+    assert forecast.left_s() is not None
+
+
+def test_what_is_at_work_says_how_long_the_run_still_takes() -> None:
+    clock = Clock()
+    voice = Voice(clock)
+    progress = Progress(io.StringIO(), voice=voice)
+    forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0)
+    progress.with_forecast(
+        forecast
+    )  # what was made before speaks for the whole command
+    clock.now_s += 4.0
+    assert (
+        voice.wanted(stays=True) == "beginning: at work for 4 s, about 80 s left in all"
+    )
+
+
 def test_where_nothing_may_follow_the_first_model_one_forecast_is_told() -> None:
     clock = Clock()
     forecast = Forecast(10, 45, clock, num_learned_pairs=45, goes_on=False)
@@ -149,15 +205,23 @@ def test_mapping_is_not_at_its_end_with_the_last_photograph() -> None:
     assert after_s > GOES_ON_SHARE * 60.0
 
 
-def test_a_run_is_forecast_by_its_megapixels_before_a_photograph_is_done() -> None:
-    """Ten photographs of two megapixels take ten seconds on three cores, at first."""
+def test_a_run_is_forecast_by_its_megapixels_before_a_photograph_is_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ten photographs of two megapixels take ten seconds on three cores, after what is loaded."""
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
     clock = Clock()
     forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0, num_cores=3)
-    clock.now_s += MIN_ELAPSED_S
-    assert forecast.left_s() is None
-    forecast.begin("extract", 10)
-    units = 10 + 45 * (COSTS["match"] + COSTS["verify"]) + 12 * COSTS["map"]
+    adjusting = 2 * COSTS["map"]
+    units = 10 * (1 + MAP_CORE_S / (2 * CORE_S_PER_MEGAPIXEL)) + adjusting
+    units += 45 * (COSTS["match"] + COSTS["verify"])
     assert pytest.approx(1.5, rel=0.3) == CORE_S_PER_MEGAPIXEL
+    assert pytest.approx(1.5, rel=0.3) == LOADING_CORE_S
+    assert pytest.approx(0.3, rel=0.5) == MAP_CORE_S
+    assert forecast.left_s() == pytest.approx(LOADING_CORE_S + 1.0 * units, rel=0.3)
+    clock.now_s += 60.0  # of loading on a busy machine
+    assert forecast.left_s() == pytest.approx(1.0 * units, rel=0.3)
+    forecast.begin("extract", 10)
     assert forecast.left_s() == pytest.approx(1.0 * units, rel=0.3)
     clock.now_s += 6.0  # three cores work on the first three: two seconds each at least
     unit_s = 6.0 / 3
@@ -217,6 +281,17 @@ def test_a_voice_speaks_after_four_seconds_and_seldomer_where_lines_stay() -> No
     assert voice.wanted(stays=True) == ""
     now_s += 1.0
     assert voice.wanted(stays=True) == "pictures: at work for 4 s"
+
+
+def test_a_voice_counts_what_a_person_has_waited_before() -> None:
+    clock = Clock()
+    clock.now_s = 10.0
+    voice = Voice(clock)
+    voice.heard("inspect", ago_s=2.5)
+    clock.now_s += 1.0
+    assert voice.wanted(stays=True) == ""
+    clock.now_s += 1.0
+    assert voice.wanted(stays=True) == "inspect: at work for 4 s"
 
 
 def test_a_voice_counts_seconds_where_a_line_is_replaced() -> None:

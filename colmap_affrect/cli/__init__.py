@@ -23,12 +23,12 @@ SPEAK_THEMSELVES = ("compare", "serve")
 
 
 def main(
-    arguments: Sequence[str] | None = None, *, begin: Callable[[], None] = lambda: None
+    arguments: Sequence[str] | None = None, *, begin: Callable[[], float] = lambda: 0.0
 ) -> int:
     """Run the command line and return the exit code.
 
-    ``begin`` is called when everything is loaded, before the command begins to work. Ctrl-C goes on
-    to the caller, as KeyboardInterrupt.
+    ``begin`` is called when everything is loaded, before the command begins to work, and returns
+    for how many seconds nothing was said. Ctrl-C goes on to the caller, as KeyboardInterrupt.
     """
     try:
         return _run(sys.argv[1:] if arguments is None else arguments, begin)
@@ -45,7 +45,7 @@ def main(
         return _fail(f"{hint}: what was done before is kept")
 
 
-def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
+def _run(given: Sequence[str], begin: Callable[[], float]) -> int:
     """Parse the arguments and run their command."""
     options = build_parser().parse_args(given or ["--help"])
     options.words = (
@@ -57,10 +57,10 @@ def _run(given: Sequence[str], begin: Callable[[], None]) -> int:
         from colmap_affrect.cli import commands  # not for --help; takes seconds
 
         command = getattr(commands, options.command.replace("-", "_"), commands.stage)
-        begin()
+        waited_s = begin()
         if options.command in SPEAK_THEMSELVES:
             return command(options) or 0
-        with options.progress.never_silent(options.command):
+        with options.progress.never_silent(options.command, waited_s=waited_s):
             return command(options) or 0
 
 

@@ -19,4 +19,8 @@ if not was_there and "GLOG_log_dir" not in os.environ:
     # COLMAP would leave hidden files with the same lines in the folder for temporary files.
     pycolmap.logging.logtostderr = True
 
+if not was_there and "ipykernel" in sys.modules:
+    # In a notebook its lines on every step would stand between bars of progress.
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
+
 __all__ = ["pycolmap"]

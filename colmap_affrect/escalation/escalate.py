@@ -341,6 +341,8 @@ class Escalation:
             return False
         step = learned_step(situation)
         if step.pairs:
+            after = next_step(situation, self.context.effort)
+            self.context.progress.expect(after.left_s / available_cores())
             self.matches.update_state(
                 learned_matching=Begun(step.level, tuple(step.pairs))
             )

@@ -243,6 +243,8 @@ def forecast_of(
     num_images: int,
     num_pairs: int,
     megapixels: float = 0.0,
+    *,
+    is_new: bool = True,
 ) -> Forecast:
     """Return what forecasts a run, with what may follow its first model.
 
@@ -252,6 +254,7 @@ def forecast_of(
         num_images: photographs of the set.
         num_pairs: pairs of the set.
         megapixels: of all photographs, at the size of processing.
+        is_new: whether the run begins.
     """
     num_learned = 0  # of a larger set learned matching takes no longer than the rest
     for number in usable:
@@ -264,6 +267,7 @@ def forecast_of(
         goes_on=len(levels) > 1,
         megapixels=megapixels,
         num_cores=available_cores(),
+        is_new=is_new,
     )
 
 

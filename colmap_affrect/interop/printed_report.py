@@ -37,7 +37,7 @@ def find_browser() -> str:
 
 
 def write_report(model_path: Path, folder: Path) -> Path:
-    """Write the page of a run, and the same as a PDF where a browser is there.
+    """Write the page of a run with the files beside it, and a PDF where a browser is there.
 
     Args:
         model_path: folder of a model of the run.
@@ -62,6 +62,8 @@ def write_report(model_path: Path, folder: Path) -> Path:
     folder.mkdir()
     page = folder / "report.html"
     shutil.copyfile(workspace.page, page)
+    for beside in workspace.page_files():
+        shutil.copyfile(beside, folder / beside.name)
     browser = find_browser()
     if not browser:
         names = ", ".join(BROWSERS[:3])

@@ -124,11 +124,14 @@ def _run(
     num_pairs = _num_pairs(names, options=options.pairs, image_path=folder)
     usable = options.resources.usable_levels(recipe.extraction)
     megapixels = _megapixels(names, image_path, recipe.extraction.max_image_size_px)
-    forecast = forecast_of(recipe.levels, usable, len(names), num_pairs, megapixels)
-    context = replace(context, progress=replace(context.progress, forecast=forecast))
+    is_new = overwrite or not workspace.features.exists()
+    forecast = forecast_of(
+        recipe.levels, usable, len(names), num_pairs, megapixels, is_new=is_new
+    )
+    context = replace(context, progress=context.progress.with_forecast(forecast))
     _prepare_parts(context, recipe)
     later = options.later_stages()
-    if overwrite or not workspace.features.exists():
+    if is_new:
         recipe.matching.load_meanwhile(num_pairs)
     with workspace.locked(), mend_and_seal(context, follows=False, discards=overwrite):
         reports = [

@@ -65,7 +65,10 @@ class LineReport:
                 f"the lines tell a focal length of {lens} within {self.focal_sigma:.0%}"
             )
         else:
-            text = f"the lines do not tell the focal length: {lens} within {self.focal_sigma:.0%}"
+            text = (
+                "the lines do not tell the focal length well enough: "
+                f"{lens} within {self.focal_sigma:.0%}"
+            )
         if self.is_shifted and self.shift_px is not None:
             side = "below" if self.shift_px > 0.0 else "above"
             text += (

@@ -169,6 +169,22 @@ class Workspace:
                 outputs.refuse_what_waits(path)
             outputs.refuse_other_kind(path, OWN_FILES, OWN_FOLDERS)
 
+    def page_file(self, number: int) -> Path:
+        """Return the path of a file that the page reads when it is asked for what is in it."""
+        return self.path / f"report.pairs-{number}.js"
+
+    def page_files(self) -> list[Path]:
+        """Return the files beside the page that are there."""
+        found = []
+        for path in sorted(self.path.glob("report.pairs-[0-9]*.js")):
+            if path.is_file() and not path.is_symlink():
+                found.append(path)
+        return found
+
+    def remove_page(self) -> None:
+        """Remove the page and the files beside it."""
+        outputs.remove_own([self.page, *self.page_files()])
+
     def begin(self) -> None:
         """Make the folder, unless it is there, and say in its log whose it is."""
         self.require_own()
@@ -459,6 +475,7 @@ class Workspace:
                 self.learned,
                 self.report,
                 self.page,
+                *self.page_files(),
                 self.mapped_database,
             ],
             "guide": [self.guided],

@@ -41,10 +41,11 @@ class Page:
     # What more the scripts read, and their files
     script_data: Mapping[str, Any] = field(default_factory=dict)
     scripts: Sequence[str] = ("page.js", "geometry.js", "viewer.js")
+    reads_files: bool = False  # scripts beside it, at a click
 
 
 def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
-    """Fill a template and write it as one file that loads nothing.
+    """Fill a template and write it as one file that loads nothing by itself.
 
     No folder of this machine is in the page, since pages are sent to others.
 
@@ -90,6 +91,7 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
         "inlier_colors": INLIER_COLORS,
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
         "scripts": digests,
+        "reads_files": page.reads_files,
         "script_data": _script_data(page),
         "thumbnails": (
             thumbnails(page.image_path, page.names, progress) if page.image_path else {}

@@ -2,7 +2,8 @@
 
 It listens on 127.0.0.1 alone. Its addresses begin with a secret that only the command prints;
 requests that other pages make, under names of other hosts or from other origins, are refused. It
-serves the page of the run, which is read anew each time, and nothing else that is on the disk.
+serves the page of the run and the files beside it, which are read anew each time, and nothing
+else that is on the disk.
 """
 
 import hashlib
@@ -11,8 +12,10 @@ import logging
 import secrets
 import sys
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from socketserver import TCPServer
 from typing import Any
 
@@ -165,7 +168,11 @@ class _Handler(BaseHTTPRequestHandler):
         if why:
             self._send(HTTPStatus.FORBIDDEN, why)
             return
-        action = actions.get(self.path.removeprefix(f"/{self.server.token}/"))
+        asked = self.path.removeprefix(f"/{self.server.token}/")
+        action = actions.get(asked)
+        for path in self.server.workspace.page_files():
+            if path.name == asked and self.command == "GET":
+                action = partial(self._send_file, path)
         if action is None:
             self._send(HTTPStatus.NOT_FOUND, "there is no such page")
             return
@@ -189,13 +196,23 @@ class _Handler(BaseHTTPRequestHandler):
         return ""
 
     def _send_page(self) -> None:
+        page = self._read(self.server.workspace.page)
+        if page is not None:
+            self._send(HTTPStatus.OK, served_page(page), "text/html")
+
+    def _send_file(self, path: Path) -> None:
+        text = self._read(path)
+        if text is not None:
+            self._send(HTTPStatus.OK, text, "text/javascript")
+
+    def _read(self, path: Path) -> str | None:
+        """Read the page or a file beside it; where that is gone, say so and return None."""
         try:
-            page = self.server.workspace.page.read_text("utf-8", errors="replace")
+            return path.read_text("utf-8", errors="replace")
         except OSError:
             why = "the page is being written anew: load it again in a moment"
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, why)
-            return
-        self._send(HTTPStatus.OK, served_page(page), "text/html")
+            return None
 
     def _send_state(self) -> None:
         self._send_json(HTTPStatus.OK, self.server.mapping.state())

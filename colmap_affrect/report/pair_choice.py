@@ -23,11 +23,11 @@ class Reason(Enum):
     BRIDGE_EDGE = "it alone ties two parts of the model"
     REJECTED = "rejected by hand"
     BRIDGED = "{image} came in by this pair"
-    ONE_VIEW = "one view: of one negative, or from one place"
+    ONE_VIEW = "both show one view: prints of one negative, or taken from one place"
     DOUBTFUL = "{image} is doubtful"
     MISSING = "{image} is missing"
     STRONGEST = "the strongest pair of {image}"
-    GUIDED = "guided"
+    GUIDED = "guided matching found much of it"
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
-"""The matches of all pairs as the page of a run draws them at a click."""
+"""The matches of all pairs as the page of a run draws them at a click, and files beside it."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,20 +10,26 @@ import numpy as np
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pictures import base64_text
 
 MAX_NUM_LINES = 24_000  # of all pairs, 9 bytes each, while each pair has some; resource
 MAX_NUM_LINES_OF_PAIR = 120  # more hide what is below them
 MIN_NUM_LINES_OF_PAIR = 20  # fewer show little
-# That a page draws, the strongest: all of 100 photographs, 1.2 MB and half a minute; resource
+# That are in the page, the strongest: all of 100 photographs, 1.2 MB; resource
 MAX_NUM_PAIRS = 5_000
+# Of a file beside the page, 1.6 MB: a browser reads it in less than a second; resource
+NUM_PAIRS_OF_FILE = 5_000
+# In files, the strongest: 100 for each of 2,000 photographs, 32 MB; resource
+MAX_NUM_PAIRS_IN_FILES = 100_000
 MOST = 65_535  # of a uint16
 
 
 @dataclass(frozen=True)
 class PairLines:
-    """Lines of pairs; the other pairs are drawn by ``colmap-affrect show-pair``."""
+    """Lines of pairs."""
 
     # Numbers of the two photographs, number of lines, and what is known of the pair
     pairs: list[tuple[int, int, int, str]] = field(default_factory=list)
@@ -35,40 +42,93 @@ class PairLines:
         return {"pairs": self.pairs, "lines": self.lines}
 
 
-def lines_of_pairs(
-    reader: PairReader, names: Sequence[str], num_inliers: Mapping[Pair, int]
-) -> PairLines:
-    """Read some inliers of each verified pair, or of the strongest ones where there are very many.
+@dataclass(frozen=True)
+class PairFile:
+    """A file of lines beside the page: a script, since a page on a disk can read nothing else."""
 
-    Args:
-        reader: of the matches of a run.
-        names: of all photographs, in the order of their numbers.
-        num_inliers: of the verified pairs.
+    name: str
+    # Numbers of the photographs of its first pair, the lower one first; the pairs go on in this
+    # order from file to file
+    first: tuple[int, int]
 
-    Returns:
-        The lines, pair by pair.
+
+class LinesOfRun:
+    """The lines of a run: those of the strongest pairs in the page, of the others in files.
+
+    Attributes:
+        in_page: the strongest pairs.
+        in_files: the next ones, in the order of the files.
+        num_left_out: how many pairs are in neither.
     """
-    index = {name: number for number, name in enumerate(names)}
-    known = [pair for pair in num_inliers if {*pair} <= index.keys()]
-    known.sort(key=lambda pair: -num_inliers[pair])
-    shown = known[:MAX_NUM_PAIRS]
-    num_lines = num_lines_of_pair(len(shown))
-    reader.look_up_levels(shown)
-    found = PairLines()
-    ends = [np.empty((0, 4), dtype="<u2")]
-    kinds = [np.empty(0, dtype=np.uint8)]
-    for pair in sorted(shown):
-        try:
-            matched = reader.read(pair)
-        except AffrectError:  # of a store that is damaged: the others are shown
-            continue
-        rows = _some_inliers(matched, num_lines)
-        ends.append(_ends(matched, rows))
-        kinds.append(matched.kinds[rows].astype(np.uint8))
-        numbers = (index[pair[0]], index[pair[1]])
-        found.pairs.append((*numbers, len(rows), matched.text))
-    data = np.concatenate(ends).tobytes() + np.concatenate(kinds).tobytes()
-    return PairLines(found.pairs, base64_text(data))
+
+    def __init__(
+        self, reader: PairReader, names: Sequence[str], num_inliers: Mapping[Pair, int]
+    ) -> None:
+        """Choose which pairs go where.
+
+        Args:
+            reader: of the matches of a run.
+            names: of all photographs, in the order of their numbers.
+            num_inliers: of the verified pairs.
+        """
+        self._reader = reader
+        self._index = {name: number for number, name in enumerate(names)}
+        known = [pair for pair in num_inliers if {*pair} <= self._index.keys()]
+        known.sort(key=lambda pair: -num_inliers[pair])
+        end = MAX_NUM_PAIRS + MAX_NUM_PAIRS_IN_FILES
+        self.in_page = sorted(known[:MAX_NUM_PAIRS])
+        self.in_files = sorted(known[MAX_NUM_PAIRS:end], key=self._numbers_in_order)
+        self.num_left_out = len(known[end:])
+
+    def of_page(self) -> PairLines:
+        """Read the lines of the pairs that are in the page."""
+        return self._read(self.in_page, num_lines_of_pair(len(self.in_page)))
+
+    def write_files(self, workspace: Workspace) -> list[PairFile]:
+        """Write the lines of the other pairs into files beside the page.
+
+        Args:
+            workspace: of the run; files of an earlier page are no longer there.
+
+        Returns:
+            The files in the order of their pairs, none where the page has all.
+
+        Raises:
+            WorkspaceError: a file cannot be written.
+        """
+        written = list[PairFile]()
+        for start in range(0, len(self.in_files), NUM_PAIRS_OF_FILE):
+            pairs = self.in_files[start : start + NUM_PAIRS_OF_FILE]
+            path = workspace.page_file(len(written) + 1)
+            found = self._read(pairs, MIN_NUM_LINES_OF_PAIR)
+            content = json.dumps(found.script_data())
+            replace_text(path, f"page.takePairs({content});\n")
+            written.append(PairFile(path.name, self._numbers_in_order(pairs[0])))
+        return written
+
+    def _numbers_in_order(self, pair: Pair) -> tuple[int, int]:
+        """Return the numbers of two photographs, the lower one first."""
+        numbers = (self._index[pair[0]], self._index[pair[1]])
+        return min(numbers), max(numbers)
+
+    def _read(self, pairs: Sequence[Pair], max_num_lines: int) -> PairLines:
+        """Read at most so many lines of each pair."""
+        self._reader.look_up_levels(pairs)
+        found = PairLines()
+        ends = [np.empty((0, 4), dtype="<u2")]
+        kinds = [np.empty(0, dtype=np.uint8)]
+        for pair in pairs:
+            try:
+                matched = self._reader.read(pair)
+            except AffrectError:  # of a store that is damaged: the others are shown
+                continue
+            rows = _some_inliers(matched, max_num_lines)
+            ends.append(_ends(matched, rows))
+            kinds.append(matched.kinds[rows].astype(np.uint8))
+            numbers = (self._index[pair[0]], self._index[pair[1]])
+            found.pairs.append((*numbers, len(rows), matched.text))
+        data = np.concatenate(ends).tobytes() + np.concatenate(kinds).tobytes()
+        return PairLines(found.pairs, base64_text(data))
 
 
 def num_lines_of_pair(num_pairs: int) -> int:

@@ -18,7 +18,9 @@ from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
-NUM_KEPT = 200  # photographs whose features are kept in memory
+# Photographs whose features are kept in memory, 0.2 MB each: pairs go back to all that a
+# photograph is verified with; resource
+NUM_KEPT = 1_000
 
 
 class MatchKind(IntEnum):
@@ -78,19 +80,19 @@ class PairReader:
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
-        known = self.graph.ids
         sizes = []
         keypoints = []
+        ids = self.graph.ids
         for name in names:
-            require_known(name, known)
+            require_known(name, ids)
             camera = self.graph.cameras[name]
             sizes.append((camera.width, camera.height))
             keypoints.append(self._keypoints(name))
-        ids = (known[names[0]], known[names[1]])
+        pair_ids = (ids[names[0]], ids[names[1]])
         with self.graph.open_to_read() as database:
-            raw = np.asarray(database.read_matches(*ids), np.int64).reshape(-1, 2)
-            geometry = database.read_two_view_geometry(*ids)
-            is_matched = database.exists_matches(*ids)
+            raw = np.asarray(database.read_matches(*pair_ids), np.int64).reshape(-1, 2)
+            geometry = database.read_two_view_geometry(*pair_ids)
+            is_matched = database.exists_matches(*pair_ids)
         inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         tie_points = self._tie_points(names, keypoints)
         num_tie_points = len(tie_points[0])
@@ -130,12 +132,6 @@ class PairReader:
             with suppress(StoreError):
                 self._levels |= self.run.matches.levels_of_stored(ordered)
 
-    def _read_keypoints(self, name: str) -> Array:
-        """Return the (N, 2) px of the keypoints of a photograph, from its upper left corner."""
-        with self.graph.open_to_read() as database:
-            rows = database.read_keypoints(self.graph.ids[name])
-        return np.asarray(rows[:, :2], np.float64)
-
     def _feature_kinds(
         self, names: Pair, keypoints: list[Array], matches: Indices
     ) -> Indices:
@@ -153,6 +149,12 @@ class PairReader:
                 return np.full(len(matches), MatchKind.FOREIGN)
             kinds = np.maximum(kinds, stored[matches[:, side]])
         return kinds
+
+    def _read_keypoints(self, name: str) -> Array:
+        """Return (N, 2) px from the upper left corner of a photograph."""
+        with self.graph.open_to_read() as database:
+            rows = database.read_keypoints(self.graph.ids[name])
+        return np.asarray(rows[:, :2], np.float64)
 
     def _read_stored_kinds(self, name: str) -> Indices:
         """Return the kinds of the features of a photograph; none where the run has none."""
@@ -185,8 +187,8 @@ class PairReader:
         return [np.array(points[0]).reshape(-1, 2), np.array(points[1]).reshape(-1, 2)]
 
     def _text(self, names: Pair, num_raw: int, num_inliers: int) -> str:
-        """Return how many matches a pair has, of which level, and what the model says."""
-        text = f"{num_raw} raw matches"
+        """Return how many matches a pair has, how they came, and what the model says."""
+        text = f"{num_raw} matches"
         if self.run:
             pair = (min(names), max(names))
             if pair not in self._levels:
@@ -194,7 +196,7 @@ class PairReader:
             level = self._levels.get(pair)
             if level is not None:
                 name, _ = self._recipe_levels[level]
-                text += f" of level {level} ({name})"
+                text += f" by {name}"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))
         if share is not None:

@@ -52,12 +52,12 @@ COLORS: Mapping[int, str] = {
 }
 """Colours of lines."""
 LABELS: Mapping[int, str] = {
-    MatchKind.OWN: "own",
-    MatchKind.WARPED: "warped",
-    MatchKind.LEARNED: "learned",
-    MatchKind.GUIDED: "guided",
+    MatchKind.OWN: "as photographed",
+    MatchKind.WARPED: "in a warp",
+    MatchKind.LEARNED: "learned matching",
+    MatchKind.GUIDED: "guided matching",
     MatchKind.BY_HAND: "by hand",
-    MatchKind.FOREIGN: "inliers",
+    MatchKind.FOREIGN: "another program",
     MatchKind.REJECTED: "rejected",
 }
 """What legends call the kinds of matches."""

@@ -26,7 +26,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.page import TEMPLATES, Page, write_page
-from colmap_affrect.report.pair_lines import PairLines
+from colmap_affrect.report.pair_lines import PairFile, PairLines
 from colmap_affrect.report.pairs import LEGEND, PairPicture
 from colmap_affrect.report.photographs import (
     PhotographReport,
@@ -71,6 +71,8 @@ class RunContent:
     marks: Marks = field(default_factory=dict)  # of the tie points by hand
     pairs_to_check: Sequence[PairPicture] = ()
     pair_lines: PairLines = field(default_factory=PairLines)
+    pair_files: Sequence[PairFile] = ()  # beside the page
+    num_pairs_left_out: int = 0  # verified ones, in neither
     # In the database
     cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     marks_command: str = ""  # maps again with marks that are saved
@@ -83,7 +85,7 @@ def write_run_page(
     content: RunContent,
     progress: Progress = SILENT,
 ) -> Path:
-    """Write ``report.html`` of a run, one file that loads nothing.
+    """Write ``report.html`` of a run, one file that loads nothing but what is beside it.
 
     Args:
         workspace: of the run.
@@ -122,11 +124,14 @@ def write_run_page(
         script_data={
             **_tools(report, content),
             "pair_lines": content.pair_lines.script_data(),
+            "pair_files": [[file.name, *file.first] for file in content.pair_files],
+            "num_pairs_left_out": content.num_pairs_left_out,
             "line_colors": list(LEGEND.values()),
             "facts": _facts(report, photographs, names),
             "neighbours": _neighbours(report, photographs, names),
         },
         scripts=SCRIPTS + TOOL_SCRIPTS if can_mark else SCRIPTS,
+        reads_files=bool(content.pair_files),
     )
     return write_page(workspace.page, page, progress)
 

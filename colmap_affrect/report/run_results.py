@@ -18,7 +18,7 @@ from colmap_affrect.report.advice import (
     command_with_masks,
     command_with_tie_points,
 )
-from colmap_affrect.report.pair_lines import lines_of_pairs
+from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import draw_pairs_to_check
 from colmap_affrect.report.photographs import photographs_of_report
@@ -99,7 +99,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         untried=escalated.untried,
         **_own_results(context),
     )
-    workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
+    workspace.remove_page()  # a kill leaves none beside another report
     replace_text(workspace.report, report.to_json())
     if page:
         _write_page(context, result, report, num_inliers=pair_inliers)
@@ -132,13 +132,16 @@ def _write_page(
     """
     workspace = context.workspace
     reader = PairReader(context.graph, context)
+    lines = LinesOfRun(reader, result.names, num_inliers)
     content = RunContent(
         names=result.names,
         num_inliers=num_inliers,
         image_path=workspace.photographs(),
         marks=result.marks,
         pairs_to_check=draw_pairs_to_check(context, reader, report, num_inliers),
-        pair_lines=lines_of_pairs(reader, result.names, num_inliers),
+        pair_lines=lines.of_page(),
+        pair_files=lines.write_files(workspace),
+        num_pairs_left_out=lines.num_left_out,
         cameras=context.graph.cameras,
         marks_command=command_with_tie_points(context),
         masks_command=command_with_masks(context),

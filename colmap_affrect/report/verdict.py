@@ -142,7 +142,7 @@ def _components(
         numbers = groups[model]
         some = [photographs[names[number]] for number in numbers]
         photographs_text = "photograph" if len(numbers) == 1 else "photographs"
-        title = f"sparse/{model}: {len(numbers)} {photographs_text}"
+        title = f"Model in sparse/{model}: {len(numbers)} {photographs_text}"
         found.append(Component(title, tuple(numbers), _counts(some), model))
     lost = groups.get(None, [])
     if lost:

@@ -138,6 +138,10 @@ def forecasts_of(record: Record, times_s: Sequence[float]) -> dict[float, float 
                 # By the clock of the processor one core works
                 more = {**record.more, "num_cores": 1}
                 forecast = Forecast(record.num_images, record.num_pairs, clock, **more)
+            elif method == "expect":
+                # It is told in seconds of all cores
+                seconds = float(arguments[0]) * record.more["num_cores"]
+                forecast.expect(seconds)
             else:
                 getattr(forecast, method)(*arguments)
         clock.now_s = time_s

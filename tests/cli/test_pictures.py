@@ -65,7 +65,7 @@ def test_show_pair_draws_matches_of_a_run_and_of_any_database(
         assert (done.code, done.stderr) == (0, [])
     said, path = done.stdout.splitlines()
     assert re.match(
-        r"a\.png and side/č\.png: \d+ raw matches of level 0 \(identity\), \d+ inliers, \d+% of",
+        r"a\.png and side/č\.png: \d+ matches by identity, \d+ inliers, \d+% of",
         said,
     )
     assert path == str(verified / "pairs" / "a--side-č.png")
@@ -80,7 +80,7 @@ def test_show_pair_draws_matches_of_a_run_and_of_any_database(
     assert (done.code, done.stderr) == (0, [])
     assert (
         done.stdout.splitlines()[0]
-        == said.partition(" of level")[0] + ", " + said.split(", ")[1]
+        == said.partition(" by ")[0] + ", " + said.split(", ")[1]
     )
     before = (tmp_path / "pair.png").read_bytes()
     done = call(*given, tmp_path / "pair.png")

@@ -37,6 +37,16 @@ def test_without_a_browser_the_page_is_written_and_one_line_says_so(
     assert "report.html" in caplog.messages[0]
 
 
+def test_files_beside_the_page_go_with_it(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run / "report.pairs-1.js").write_text("page.takePairs({})", encoding="utf-8")
+    monkeypatch.setattr(printed_report, "find_browser", lambda: "")
+    folder = export(run, tmp_path / "for-others", "report")["report"].parent
+    written = sorted(path.name for path in folder.iterdir())
+    assert written == ["report.html", "report.pairs-1.js"]
+
+
 def test_a_browser_that_prints_nothing_is_named(
     run: Path,
     tmp_path: Path,

@@ -39,6 +39,8 @@ def finished(workspace: Workspace) -> Workspace:
     (workspace.sparse / "0").mkdir(parents=True)
     (workspace.sparse / "0" / "images.bin").write_bytes(b"model")
     workspace.report.write_text("{}")
+    workspace.page.write_text("<html>")
+    workspace.page_file(1).write_text("page.takePairs({})")
     return workspace
 
 

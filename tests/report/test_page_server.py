@@ -134,12 +134,28 @@ def test_who_does_not_know_the_address_is_refused(
         "%2e%2e/secret.txt",
         "/x",
         "database.db",
+        "report.pairs-2.js",
+        "report.pairs-1.js/",
     ],
 )
-def test_nothing_but_the_page_is_served(server: PageServer, path: str) -> None:
+def test_nothing_but_the_page_and_its_files_is_served(
+    server: PageServer, path: str
+) -> None:
+    server.workspace.page_file(1).write_text("page.takePairs({})", encoding="utf-8")
     status, text = ask(server, f"/{server.token}/{path}")
     assert status == 404
     assert text == "there is no such page"
+
+
+def test_the_files_beside_the_page_are_served(server: PageServer) -> None:
+    path = server.workspace.page_file(1)
+    path.write_text("page.takePairs({})", encoding="utf-8")
+    assert ask(server, path.name) == (200, "page.takePairs({})")
+
+
+def test_a_folder_with_the_name_of_such_a_file_is_not_read(server: PageServer) -> None:
+    server.workspace.page_file(1).mkdir()
+    assert ask(server, "report.pairs-1.js")[0] == 404
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "", "127.0.0.1"])

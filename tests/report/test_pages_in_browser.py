@@ -24,6 +24,7 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import pair_lines
 from colmap_affrect.report.run_page import RunContent, write_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
@@ -213,6 +214,71 @@ def test_a_click_into_the_matrix_draws_the_pair(browser: Browser) -> None:
         }
         return count""")
     assert lines > 500
+
+
+PAIR_TEXT = "return document.querySelector('#pair .readout').textContent"
+LEFT_OUT = "They share matches that this page leaves out; the command below draws them."
+SHOW_PAIR = "page.showPair(...arguments)"
+
+
+def read_of_pair(browser: Browser, one: int, two: int) -> str:
+    """What the page says of a pair, once it has read its file."""
+    browser.run(SHOW_PAIR, one, two)
+    for _ in range(100):
+        text = browser.run(PAIR_TEXT)
+        if text != "Reading what they share.":
+            break
+        time.sleep(0.02)
+    return str(text)
+
+
+@pytest.fixture
+def page_with_files(
+    running: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A page that has two of 15 pairs, eight in two files, and leaves five out."""
+    monkeypatch.setattr(pair_lines, "MAX_NUM_PAIRS", 2)
+    monkeypatch.setattr(pair_lines, "NUM_PAIRS_OF_FILE", 4)
+    monkeypatch.setattr(pair_lines, "MAX_NUM_PAIRS_IN_FILES", 8)
+    page = make_run_page(tmp_path)
+    files = sorted(path.name for path in page.parent.glob("*.js"))
+    assert files == ["report.pairs-1.js", "report.pairs-2.js"]
+    running.resize(1200)
+    running.open(page)
+    return page
+
+
+def test_pairs_that_are_not_in_the_page_are_read_from_files_beside_it(
+    running: Browser,
+    page_with_files: Path,  # noqa: ARG001 (it is open)
+) -> None:
+    """A page on a disk may read no file but by a script; each is loaded once, by a click."""
+    loaded = """return [...document.querySelectorAll("script[src]")]
+        .map((one) => one.getAttribute("src"))"""
+    assert running.run(loaded) == []
+    texts = []
+    for one in range(6):
+        for two in range(one):
+            texts.append(read_of_pair(running, one, two))
+    drawn = [text for text in texts if "of them are drawn" in text]
+    assert len(drawn) == 10
+    assert texts.count(LEFT_OUT) == 5
+    assert sorted(running.run(loaded)) == ["report.pairs-1.js", "report.pairs-2.js"]
+    assert running.log() == []
+
+
+def test_a_page_without_the_files_beside_it_says_which_one_belongs_there(
+    running: Browser, page_with_files: Path
+) -> None:
+    for path in page_with_files.parent.glob("report.pairs-*.js"):
+        path.unlink()
+    texts = set()
+    for one in range(6):
+        for two in range(one):
+            texts.add(read_of_pair(running, one, two))
+    missing = "Not found: report.pairs-1.js. It belongs beside this page"
+    assert any(text.startswith(missing) for text in texts)
+    running.log()  # in which the browser says so, too
 
 
 def test_photographs_of_a_pair_are_chosen_from_lists_too(browser: Browser) -> None:

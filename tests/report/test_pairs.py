@@ -33,7 +33,10 @@ from colmap_affrect.report import pairs
 from colmap_affrect.report.pair_choice import pairs_to_check
 from colmap_affrect.report.pair_lines import (
     MAX_NUM_PAIRS,
-    lines_of_pairs,
+    MAX_NUM_PAIRS_IN_FILES,
+    MIN_NUM_LINES_OF_PAIR,
+    NUM_PAIRS_OF_FILE,
+    LinesOfRun,
     num_lines_of_pair,
 )
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
@@ -206,8 +209,7 @@ def test_a_pair_of_a_run_is_known_with_kinds_level_and_model(
     np.testing.assert_allclose([places[-1] for places in pair.points], marks)
     count = len(inliers)
     assert pair.text == (
-        f"{count} raw matches of level 1 (second), {count} inliers, 100% of them agree with the "
-        "model"
+        f"{count} matches by second, {count} inliers, 100% of them agree with the model"
     )
 
 
@@ -251,7 +253,7 @@ def test_a_pair_without_any_match_is_drawn_too(scene: Path, tmp_path: Path) -> N
     said = pairs.draw_pair(
         path, NAMES[:2], tmp_path / "photographs", tmp_path / "pair.png"
     )
-    assert said == f"a.png and b.png: 0 raw matches, 0 inliers\n{tmp_path / 'pair.png'}"
+    assert said == f"a.png and b.png: 0 matches, 0 inliers\n{tmp_path / 'pair.png'}"
 
 
 def test_a_model_that_is_turned_contradicts_pairs(scene: Path) -> None:
@@ -290,7 +292,10 @@ def test_each_sort_of_pairs_is_among_those_to_look_at(tmp_path: Path) -> None:
         ("a", "f"): "f is doubtful; the strongest pair of f",
         ("f", "g"): "g is missing",
         ("d", "e"): "the strongest pair of e",
-        ("b", "c"): "it alone ties two parts of the model; guided",
+        (
+            "b",
+            "c",
+        ): "it alone ties two parts of the model; guided matching found much of it",
         ("c", "d"): "it alone ties two parts of the model; the strongest pair of d",
     }
 
@@ -348,6 +353,13 @@ def test_a_page_draws_each_pair_and_fewer_lines_of_each_where_there_are_many() -
     assert MAX_NUM_PAIRS >= 100 * 99 / 2
 
 
+def test_files_beside_the_page_are_small_and_all_of_them_can_be_kept() -> None:
+    """A pair is twenty lines of nine bytes, as base64, and a text of 100 letters."""
+    num_bytes = 4 / 3 * 9 * MIN_NUM_LINES_OF_PAIR + 100
+    assert 1e6 < num_bytes * NUM_PAIRS_OF_FILE < 3e6
+    assert 20e6 < num_bytes * MAX_NUM_PAIRS_IN_FILES < 50e6
+
+
 def test_images_are_read_once_for_all_pairs_and_levels_together(
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,6 +369,6 @@ def test_images_are_read_once_for_all_pairs_and_levels_together(
     images = Mock(wraps=view_graph._read_images)
     monkeypatch.setattr(view_graph, "_read_images", images)
     reader = PairReader(ViewGraph(scene / "database.db"), stores)
-    found = lines_of_pairs(reader, NAMES, dict.fromkeys(combinations(NAMES, 2), 30))
-    assert len(found.pairs) == 15
+    lines = LinesOfRun(reader, NAMES, dict.fromkeys(combinations(NAMES, 2), 30))
+    assert len(lines.of_page().pairs) == 15
     assert (images.call_count, levels.call_count) == (1, 1)

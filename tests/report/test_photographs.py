@@ -203,7 +203,10 @@ def test_a_headline_counts_models_apart_from_what_is_sure(tmp_path: Path) -> Non
         "1 of 2 photographs are placed surely, 1 doubtful; 2 models"
     )
     titles = [component.title for component in verdict.components]
-    assert titles == ["sparse/0: 1 photograph", "sparse/1: 1 photograph"]
+    assert titles == [
+        "Model in sparse/0: 1 photograph",
+        "Model in sparse/1: 1 photograph",
+    ]
 
 
 @pytest.mark.parametrize(("qualities", "headline"), QUALITIES_AND_HEADLINES)

@@ -19,7 +19,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import Advice
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report import pictures
+from colmap_affrect.report import pictures, run_page
+from colmap_affrect.report.pair_lines import PairFile
 from colmap_affrect.report.run_page import RunContent, inlier_matrix, write_run_page
 from colmap_affrect.session.view_graph import ViewGraph
 
@@ -79,6 +80,26 @@ def test_only_the_scripts_of_the_page_may_run(html: str) -> None:
     assert markup.unescape(policy) == (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
     )
+
+
+def test_only_a_page_with_files_beside_it_may_load_scripts(
+    html: str, tmp_path: Path
+) -> None:
+    assert "'self'" not in html
+    content = RunContent(NAMES, {}, pair_files=[PairFile("report.pairs-1.js", (0, 1))])
+    page = write_run_page(Workspace(tmp_path), small_report(tmp_path), content)
+    assert "script-src 'self' file: 'sha256-" in page.read_text(encoding="utf-8")
+
+
+def test_without_a_matrix_pairs_are_chosen_from_lists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_page, "MAX_NUM_IN_MATRIX", 5)
+    content = RunContent(NAMES, {NAMES[:2]: 60})
+    page = write_run_page(Workspace(tmp_path), small_report(tmp_path), content)
+    text = page.read_text(encoding="utf-8")
+    assert 'id="pair-choice"' in text
+    assert "<svg" not in text.split('<section id="pairs">')[1].split("</section>")[0]
 
 
 def test_the_tool_for_tie_points_knows_names_and_sizes(html: str) -> None:

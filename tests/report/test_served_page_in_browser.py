@@ -136,4 +136,6 @@ def test_marks_and_masks_are_mapped_at_a_click(browser: Browser, out: Path) -> N
         rest, errors = process.communicate(timeout=20)
     assert process.returncode == 0
     assert "ended" in rest
-    assert errors == ""
+    # On a busy machine it says that Python loads packages
+    others = [line for line in errors.splitlines() if not line.startswith("loading: ")]
+    assert others == []

@@ -300,7 +300,7 @@ def test_a_lost_photograph_comes_back_by_what_was_clicked(
     assert list(lost.report["unregistered"]) == [LOST]
 
     browser.open(tmp_path / "out" / "report.html")
-    assert "not registered" in browser.run(TEXT, "#tie-points figure option:checked")
+    assert "not placed" in browser.run(TEXT, "#tie-points figure option:checked")
     others = [name for name in SCENE_NAMES if name != LOST][:2]
     clicked = {}
     for photograph, pane in ((LOST, 0), (others[0], 1), (others[1], 1)):

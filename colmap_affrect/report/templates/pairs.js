@@ -3,6 +3,9 @@
 (() => {
   const { data, all, label, bytes, picture } = page;
   const MAX_NUMBERED = 14;
+  const inliers = data.matrix ? new DataView(bytes(data.matrix).buffer) : null;
+  // Of a page of very many photographs, which has no matrix, null: nobody knows before.
+  const countOf = (one, two) => inliers?.getUint16(2 * (one * data.names.length + two), true) ?? null;
 
   // Colours of the classes, numbers in a few large cells, and that under the pointer.
   function drawMatrix(svg, counts, size) {
@@ -28,10 +31,9 @@
     svg.querySelector("image").setAttribute("href", canvas.toDataURL());
   }
   for (const matrix of all("[data-matrix]")) {
-    const counts = new DataView(bytes(data.matrix).buffer);
     const readout = matrix.parentElement.querySelector(".readout");
     const size = data.names.length;
-    drawMatrix(matrix, counts, size);
+    drawMatrix(matrix, inliers, size);
     const cellAt = (event) => {
       const ground = matrix.querySelector(".ground").getBoundingClientRect();
       const column = Math.floor(((event.clientX - ground.left) / ground.width) * size);
@@ -45,7 +47,7 @@
         readout.textContent = "\u00a0";
         return;
       }
-      const count = counts.getUint16(2 * (cell[0] * size + cell[1]), true);
+      const count = countOf(...cell);
       readout.textContent = `${label(cell[0])} – ${label(cell[1])}: ${count || "no"} inliers`;
     };
     matrix.addEventListener("pointermove", show);
@@ -63,20 +65,50 @@
   const lists = all("#pair-choice select");
   const [GAP_PX, DOT_PX] = [8, 2.5];
   const known = new Map();
-  const ends = { values: null, kinds: null };
   let shown = [0, 1];
-  (() => {
-    const buffer = bytes(data.pair_lines.lines).buffer;
-    const total = data.pair_lines.pairs.reduce((sum, [, , count]) => sum + count, 0);
-    ends.values = new Uint16Array(buffer, 0, 4 * total);
-    ends.kinds = new Uint8Array(buffer, 8 * total);
+
+  // Lines of some pairs, from the page or from a file beside it.
+  function take({ pairs, lines }) {
+    const buffer = bytes(lines).buffer;
+    const total = pairs.reduce((sum, [, , count]) => sum + count, 0);
+    const values = new Uint16Array(buffer, 0, 4 * total);
+    const kinds = new Uint8Array(buffer, 8 * total);
     let start = 0;
-    for (const [one, two, count, text] of data.pair_lines.pairs) {
-      known.set(`${one} ${two}`, { start, count, text, isTurned: false });
-      known.set(`${two} ${one}`, { start, count, text, isTurned: true });
+    for (const [one, two, count, text] of pairs) {
+      const found = { values, kinds, start, count, text };
+      known.set(`${one} ${two}`, { ...found, isTurned: false });
+      known.set(`${two} ${one}`, { ...found, isTurned: true });
       start += count;
     }
-  })();
+  }
+  take(data.pair_lines);
+
+  // Files beside the page have the pairs that are not in it, in order; each is a script, since a
+  // page on a disk can read nothing else.
+  const files = data.pair_files ?? [];
+  const asked = new Map();
+  const isAtOrBefore = (file, low, high) => file[1] < low || (file[1] === low && file[2] <= high);
+  function fileOf(one, two) {
+    const [low, high] = [Math.min(one, two), Math.max(one, two)];
+    return files.findLast((file) => isAtOrBefore(file, low, high))?.[0];
+  }
+  function read(name) {
+    if (!asked.has(name)) {
+      asked.set(name, new Promise((resolve) => {
+        const script = document.createElement("script");
+        script.addEventListener("load", () => resolve(true));
+        script.addEventListener("error", () => {
+          asked.delete(name);
+          script.remove();
+          resolve(false);
+        });
+        script.src = name;
+        document.head.append(script);
+      }));
+    }
+    return asked.get(name);
+  }
+  page.takePairs = take;
 
   const asCell = (name) => (/[",]/.test(name) ? `"${name.replaceAll('"', '""')}"` : name);
   const forShell = (text) => (/^[\w.,/-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\"'\"'")}'`);
@@ -108,9 +140,9 @@
       const at = [0, 1].map((side) => {
         const from = 4 * row + 2 * (lines.isTurned ? 1 - side : side);
         const [x, y, wide, high] = places[side];
-        return [x + (ends.values[from] / 65535) * wide, y + (ends.values[from + 1] / 65535) * high];
+        return [x + (lines.values[from] / 65535) * wide, y + (lines.values[from + 1] / 65535) * high];
       });
-      context.strokeStyle = context.fillStyle = data.line_colors[ends.kinds[row]];
+      context.strokeStyle = context.fillStyle = data.line_colors[lines.kinds[row]];
       context.lineWidth = 1;
       context.globalAlpha = 0.7;
       context.beginPath();
@@ -126,7 +158,25 @@
     }
   }
 
-  function showPair(one, two) {
+  function textOf(one, two) {
+    const lines = known.get(`${one} ${two}`);
+    if (lines) return `${lines.text}; ${lines.count} of them are drawn. Where they are wrong, run again with:`;
+    const isComplete = !data.num_pairs_left_out || countOf(one, two) === 0;
+    return isComplete ? "They share no verified match. What was rejected, if anything, is drawn by:" : "They share matches that this page leaves out; the command below draws them.";
+  }
+
+  async function showPair(one, two) {
+    const isInFile = !known.has(`${one} ${two}`) && countOf(one, two) !== 0;
+    const name = isInFile ? fileOf(one, two) : undefined;
+    showFigure(one, two, name ? "Reading what they share." : textOf(one, two));
+    if (!name) return;
+    const isRead = await read(name);
+    if (shown[0] !== one || shown[1] !== two) return;
+    const lacking = `Not found: ${name}. It belongs beside this page; copy it there, and click again.`;
+    showFigure(one, two, isRead ? textOf(one, two) : lacking);
+  }
+
+  function showFigure(one, two, text) {
     shown = [one, two];
     lists.forEach((list, side) => (list.value = shown[side]));
     const lines = known.get(`${one} ${two}`);
@@ -138,7 +188,6 @@
     }));
     figure.hidden = false;
     canvas.setAttribute("aria-label", `Matches of ${label(one)} and ${label(two)}`);
-    const text = lines ? `${lines.text}; ${lines.count} of them are drawn.` : "They share no verified match, or none is in this page.";
     figure.querySelector(".readout").textContent = text;
     figure.querySelector("code").textContent = lines
       ? `--reject-pair ${forShell(names.map(asCell).join())}`

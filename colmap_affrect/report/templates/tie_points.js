@@ -178,7 +178,7 @@
       this.readout = figure.querySelector(".readout");
       this.pointers = new Map();
       this.dragged = 0;
-      const fate = (index) => (isLost(index) ? " (not registered)" : "");
+      const fate = (index) => (isLost(index) ? " (not placed)" : "");
       const option = (index) => new Option(label(index) + fate(index), index);
       this.list.append(...usable.map(option));
       this.list.addEventListener("change", () => this.load(Number(this.list.value)));

@@ -622,7 +622,7 @@
       const fate = cards[index]?.querySelector(".fate")?.textContent.trim();
       for (const model of models) {
         const isHere = model.drawn.some((camera) => camera.index === index);
-        const text = isHere ? fate : "not registered";
+        const text = isHere ? fate : "not in this model";
         model.readout.textContent = index < 0 ? "\u00a0" : label(index) + (text ? `: ${text}` : "");
       }
       this.preview.hidden = index < 0 || !source(index);
