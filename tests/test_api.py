@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import typing
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -343,6 +343,17 @@ def test_a_notebook_shows_counts_photographs_and_what_to_try(tmp_path: Path) -> 
     assert pairs["e.png"] == "no verified pair"
     assert pairs["Try: one camera"].startswith("colmap-affrect run")
     assert text[-1] == str(tmp_path / "out")
+
+
+def test_a_notebook_rounds_no_probability_up_to_what_it_is_not(tmp_path: Path) -> None:
+    """Doubtful is below one half, and nothing is right for sure."""
+    largest = report_of(tmp_path).models[0]
+    doubtful = next(iter(largest.doubtful))
+    changed = {**largest.probabilities, NAMES[0]: 0.999, doubtful: 0.498}
+    models = (replace(largest, probabilities=changed),)
+    words = Text(report_of(tmp_path, models=models)._repr_html_()).words
+    shown = dict(reversed([*pairwise(words)]))
+    assert (shown[NAMES[0]], shown[doubtful]) == (">99%", "49%")
 
 
 def test_a_notebook_links_a_page_below_its_folder_alone(

@@ -218,7 +218,7 @@ FLAGS: dict[str, Settings] = {
     "--features-path": _path("FILE", "HDF5 file of features"),
     "--matches-path": _path("FILE", "HDF5 file of matches"),
     "--matches-path@given": _path("FILE", "matches of hloc or deep-image-matching (HDF5), or a "
-        "list of COLMAP's matches_importer (default: those of the database, else images are "
+        "list of COLMAP's matches_importer (default: those that a database has, else images are "
         "matched by their descriptors)"),
     "--match-type": _value("TYPE", "what --matches-path has: raw matches, or inliers, which are "
         "taken for verified (default: raw)", choices=["raw", "inliers"]),

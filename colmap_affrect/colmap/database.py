@@ -171,7 +171,8 @@ def spatial_pairs(
         logger.warning("%s: positions that do not count: %s", path, such_as(reasons))
     if len(positions) < 2:
         raise DatabaseError(
-            f"{len(positions)} images have a position (GPS in EXIF, or pose priors)",
+            f"{len(positions)} images have a position (latitude, longitude and altitude in "
+            "EXIF, or pose priors)",
             where=path,
             advice="choose pairs in another way",
         )

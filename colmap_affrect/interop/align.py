@@ -44,6 +44,9 @@ WGS84 = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 # theory: of receivers without corrections
 GPS_ERROR_M = 10.0
 TABLE_ERROR = 0.02  # the same of other positions, of how far they spread; judged
+# Share of the variance of places that an aligned model leaves open: beyond, their errors are larger
+# than what it explains; theory
+MAX_UNEXPLAINED = 0.5
 SHOWN = 12  # residuals in the summary, the largest first; display
 
 Distance = Annotated[tuple[str, str, float], Field(strict=False)]  # a list, too
@@ -76,6 +79,16 @@ class Alignment(Summarized):
     """Why positions did not count."""
     upright: str = ""
     """Whose straight lines tell where up is, where distances alone are known; z is up then."""
+    spread: float = 0.0
+    """How far positions or control points are from their middle, root mean square, in metres."""
+
+    @property
+    def contradicts_itself(self) -> bool:
+        """Whether places are off by so much that they hardly tell scale and directions."""
+        if not self.spread:
+            return False
+        variance = np.mean(np.square(list(self.residuals.values())))
+        return bool(variance > MAX_UNEXPLAINED * self.spread**2)
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -91,6 +104,11 @@ class Alignment(Summarized):
             lines += [
                 f"            {name} {value:.3g}" for name, value in largest[:SHOWN]
             ]
+        if self.contradicts_itself:
+            lines.append(
+                f"doubtful    places that spread {self.spread:.3g} m are off by too much to "
+                "tell scale and directions: mend them, or give others"
+            )
         lines += [
             f"left out    {name}: {why}" for name, why in sorted(self.left_out.items())
         ]
@@ -171,6 +189,7 @@ def _align(model_path: Path, output_path: Path, reference: Reference) -> Alignme
         residuals=fit.residuals,
         left_out=fit.left_out,
         upright=upright,
+        spread=fit.spread,
     )
 
 
@@ -183,12 +202,14 @@ class _Fit:
         residuals: how far each position, point or distance is off, in metres.
         origin: latitude, longitude and altitude (WGS 84) of the new origin; empty if not on earth.
         left_out: why positions did not count.
+        spread: how far true places are from their middle, root mean square, in metres.
     """
 
     new_from_old: pycolmap.Sim3d
     residuals: dict[str, float]
     origin: tuple[float, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
+    spread: float = 0.0
 
 
 def _fit(
@@ -293,7 +314,7 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
         )
     before = np.array([old[name] for name in names])
     after = np.array([true[name] for name in names])
-    origin = tuple(after.mean(axis=0).tolist()) if is_on_earth else ()
+    origin = _middle_on_earth(after) if is_on_earth else ()
     if origin:
         after = np.asarray(WGS84.ellipsoid_to_enu(after, *origin))
     for points in (before, after):
@@ -314,11 +335,25 @@ def _similarity(old: Places, true: Places, *, is_on_earth: bool) -> _Fit:
             "the known places do not fit the model in any scale and rotation"
         )
     residuals = residuals_of(new_from_old, before, after).tolist()
+    from_middle = np.linalg.norm(after - after.mean(axis=0), axis=1)
     return _Fit(
         new_from_old=new_from_old,
         residuals=dict(zip(names, residuals, strict=True)),
         origin=origin,
+        spread=float(np.sqrt(np.mean(from_middle**2))),
     )
+
+
+def _middle_on_earth(positions: Array) -> tuple[float, ...]:
+    """Return latitude, longitude and altitude amid (N, 3) positions.
+
+    Longitudes have no mean across 180 degrees or at a pole, places in space have one. That is below
+    the ground where positions are far apart, so that its altitude does not count.
+    """
+    in_space = np.asarray(WGS84.ellipsoid_to_ecef(positions)).mean(axis=0)
+    latitude, longitude, _ = np.asarray(WGS84.ecef_to_ellipsoid(in_space[None]))[0]
+    altitude = positions[:, 2].mean()
+    return float(latitude), float(longitude), float(altitude)
 
 
 def _scale(places: Places, distances: Sequence[tuple[str, str, float]]) -> _Fit:
@@ -357,7 +392,7 @@ def _gps(path: Path) -> tuple[Places, bool]:
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
         raise DatabaseError(
-            "no photograph has a position",
+            "no photograph has a position (latitude, longitude and altitude)",
             where=path,
             advice=("give ", Option("positions"), " FILE"),
         )

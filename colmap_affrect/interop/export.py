@@ -180,18 +180,23 @@ def _points(source: Source, folder: Path) -> Path:
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
-    why = _why_no_text(source)
-    if why:
-        raise OptionError(
-            why,
-            where="text",
-            advice="rename the photographs and run again, or leave that format out and "
-            "use the binary model as it is",
-        )
+    _require_names_of_text(source, "text")
     with native_writes(path):
         path.mkdir()
         source.model.write_text(path)
     return path
+
+
+def _require_names_of_text(source: Source, name: str) -> None:
+    """Refuse a format that has the model as text where nobody could read that back."""
+    why = _why_no_text(source)
+    if why:
+        raise OptionError(
+            why,
+            where=name,
+            advice="rename the photographs and run again, or leave that format out and "
+            "use the binary model as it is",
+        )
 
 
 def _usual(source: Source) -> Sequence[str]:
@@ -286,16 +291,12 @@ def _require_size(path: Path, camera: pycolmap.Camera) -> None:
 def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
-    try:
-        flat = Source(
-            path=path,
-            model=read_given_model(path / "sparse"),
-            image_path=None,
-            is_upright=source.is_upright,
-        )
-    except (OptionError, StoreError) as error:
-        # COLMAP does not say so when it writes
-        raise why_not_written(path / "sparse", error) from error
+    flat = Source(
+        path=path,
+        model=_undistorted_model(path),
+        image_path=None,
+        is_upright=source.is_upright,
+    )
     with native_writes(path):
         flat.model.export_PLY(path / "points3D.ply")
         (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
@@ -308,6 +309,14 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
     }
     replace_text(path / "transforms.json", json.dumps(content, indent=1) + "\n")
     return path / "transforms.json"
+
+
+def _undistorted_model(path: Path) -> pycolmap.Reconstruction:
+    """Read the model of undistorted photographs; COLMAP does not say where it wrote half of it."""
+    try:
+        return read_given_model(path / "sparse")
+    except (OptionError, StoreError) as error:
+        raise why_not_written(path / "sparse", error) from error
 
 
 def _nerfstudio_frame(flat: Source, image: pycolmap.Image) -> dict[str, Any]:
@@ -330,8 +339,11 @@ def _nerfstudio_frame(flat: Source, image: pycolmap.Image) -> dict[str, Any]:
 
 def _mvsnet(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs their model as text, as MVSNet's programs read it."""
+    _require_names_of_text(source, "mvsnet")
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
-    pycolmap.Reconstruction(path / "sparse").write_text(path / "sparse")
+    flat = _undistorted_model(path)
+    with native_writes(path):
+        flat.write_text(path / "sparse")
     return path
 
 

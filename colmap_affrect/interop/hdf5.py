@@ -261,7 +261,7 @@ def _matches(
 ) -> Iterator[GivenMatches]:
     """Open the matches that are given, or those that the descriptors of a file make."""
     if wanted.matches_path:
-        with given_matches(wanted.matches_path, keys) as found:
+        with given_matches(wanted.matches_path, keys, wanted.image_path) as found:
             yield found
         return
     lacking = [

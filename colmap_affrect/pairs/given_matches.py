@@ -6,20 +6,33 @@
 - deep-image-matching, and notebooks of the image matching challenge: a group for the first image,
   in it for the second one the (M, 2) matches.
 - COLMAP's text lists, as ``matches_importer`` takes them: a line of two names, a line of two
-  numbers for each match, and an empty line.
+  numbers for each match, and an empty line. Names may be paths into the folder of the photographs,
+  also with backslashes, as in lists of pairs.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
 
-from colmap_affrect.errors import OptionError, StoreError, damage, such_as
+from colmap_affrect.errors import (
+    OptionError,
+    StoreError,
+    damage,
+    not_utf_8,
+    such_as,
+)
 from colmap_affrect.geometry.arrays import Indices
-from colmap_affrect.pairs.lists import Pair, split_line
+from colmap_affrect.pairs.lists import (
+    Pair,
+    spellings,
+    split_line,
+    split_of_others,
+)
 from colmap_affrect.project.given_h5 import GivenFile, open_given_file
 from colmap_affrect.project.regular_files import read_regular_text
 
@@ -43,15 +56,19 @@ class GivenMatches:
 
 
 @contextmanager
-def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
+def given_matches(
+    path: Path, names: Collection[str], image_path: Path | None = None
+) -> Iterator[GivenMatches]:
     """Open a file of matches of named images.
 
     Args:
         path: HDF5 file, or text.
         names: of the images that have features.
+        image_path: folder of the photographs, into which paths in text may lead; None: they are
+            refused.
 
     Raises:
-        OptionError: when there is no such file.
+        OptionError: when there is no such file, or it is text in another encoding than UTF-8.
         StoreError: when it is damaged, or names other images.
     """
     if not path.is_file():
@@ -59,7 +76,8 @@ def given_matches(path: Path, names: Collection[str]) -> Iterator[GivenMatches]:
     with path.open("rb") as file:
         has_signature = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
     if not has_signature and path.suffix != ".h5":
-        yield _read_list(path, names)
+        folders = spellings(image_path) if image_path else ()
+        yield _read_list(path, names, folders)
         return
     with open_given_file(path) as source:
         yield _of_hdf5(source, names)
@@ -116,7 +134,11 @@ def _hloc_pairs(
     source: GivenFile, names: Collection[str]
 ) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file of hloc with their keys."""
-    by_key = {name.replace("/", "-"): name for name in names}
+    by_key: dict[str, str] = {}
+    for written, name in _as_written(names).items():
+        by_key[written.replace("/", "-")] = name
+    for name in names:  # whole names come before others that look like them
+        by_key[name.replace("/", "-")] = name
     unknown = []
     for key in source.groups_with(HLOC):
         found = list(_splits(key, "/", by_key)) or list(_splits(key, "_", by_key))
@@ -139,9 +161,7 @@ def _nested_pairs(
     source: GivenFile, names: Collection[str]
 ) -> Iterator[tuple[Pair, str]]:
     """Yield the pairs of a file with a group for each first image."""
-    by_key = {name: name for name in names}
-    for name in names:
-        by_key.setdefault(Path(name).name, name)
+    by_key = _as_written(names)
     unknown = []
     has_matches = False
     for key, shape in sorted(source.shapes.items()):
@@ -156,6 +176,18 @@ def _nested_pairs(
     if not has_matches:
         source.groups_with(HLOC)  # which says what is missing
     _refuse_unknown(source.path, unknown)
+
+
+def _as_written(names: Collection[str]) -> dict[str, str]:
+    """Return images by their names, and without folders where only one image is called so."""
+    count = Counter(PurePosixPath(name).name for name in names)
+    images: dict[str, str] = {}
+    for name in names:
+        without_folder = PurePosixPath(name).name
+        if count[without_folder] == 1:
+            images[without_folder] = name
+        images[name] = name
+    return images
 
 
 def _splits(key: str, separator: str, by_key: Mapping[str, str]) -> Iterator[Pair]:
@@ -175,25 +207,34 @@ def _refuse_unknown(path: Path, keys: Collection[str]) -> None:
         )
 
 
-def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
-    """Read a text list of COLMAP."""
-    known = set(names)
+def _read_list(
+    path: Path, names: Collection[str], folders: Sequence[str]
+) -> GivenMatches:
+    """Read a text list of COLMAP.
+
+    Args:
+        path: the list.
+        names: of the images that have features.
+        folders: how paths into the folder of the photographs begin.
+    """
+    known = _as_written(names)
     found: dict[Pair, Indices] = {}
     with damage(path, COMPLETE):
-        lines = read_regular_text(path, "utf-8-sig").splitlines()
+        lines = _lines(path)
         number = 0
         while number < len(lines):
             line = lines[number].strip()
             number += 1
             if not line or line.startswith("#"):
                 continue
-            pair = split_line(line, known)
-            if not pair:
+            written = split_line(line, known) or split_of_others(line, known, folders)
+            if not written:
                 raise StoreError(
                     f"line {number}: {line!r} is not two names of images that have "
                     "features, nor two numbers of features",
                     where=path,
                 )
+            pair = (known[written[0]], known[written[1]])
             end = _end_of_matches(lines, number)
             is_known = pair in found or pair[::-1] in found
             if pair[0] != pair[1] and not is_known:
@@ -209,6 +250,13 @@ def _read_list(path: Path, names: Collection[str]) -> GivenMatches:
     return GivenMatches(
         path=path, pairs=tuple(found), read=lambda _: iter(found.items())
     )
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_regular_text(path, "utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise not_utf_8(path) from error
 
 
 def _end_of_matches(lines: Sequence[str], begin: int) -> int:

@@ -5,6 +5,7 @@ import io
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -230,7 +231,7 @@ def read_pairs(
         AffrectError: when it is unreadable, or a name is not among ``names``.
     """
     ordered = sorted(set(names))
-    folders = _spellings(image_path) if image_path else ()
+    folders = spellings(image_path) if image_path else ()
     found = _read_codes(path, ordered, folders)
     found.sort()  # np.unique takes seven times as much memory
     found = found[np.flatnonzero(np.diff(found, prepend=-1))]
@@ -329,7 +330,7 @@ def _codes(
         pair = _two_words(line, number)
         pair = pair or split_line(line.rstrip("\n"), number)
         pair = pair or split_line(line.strip(), number)
-        pair = pair or _split_of_others(line, number, folders)
+        pair = pair or split_of_others(line, number, folders)
         if pair:
             low, high = sorted((number[pair[0]], number[pair[1]]))
             if low < high:
@@ -378,10 +379,16 @@ def split_line(line: str, known: Collection[str]) -> Pair | None:
     return None
 
 
-def _split_of_others(
+def split_of_others(
     line: str, known: Collection[str], folders: Sequence[str]
 ) -> Pair | None:
-    """Return the two names of a line that has a score, backslashes, or paths into a folder."""
+    """Return the two names of a line that has a score, backslashes, or paths into a folder.
+
+    Args:
+        line: of a list.
+        known: names that it may have.
+        folders: how paths into the folder of the photographs begin (:func:`spellings`).
+    """
     if len(line) > LONGEST_LINE:
         return None
     text = line.strip().replace("\\", "/")
@@ -391,9 +398,14 @@ def _split_of_others(
     return split_line(text, known) or split_line(SCORE.sub("", text), known)
 
 
-def _spellings(folder: Path) -> tuple[str, ...]:
+def spellings(folder: Path) -> tuple[str, ...]:
     """Return how the path of a folder may begin those of the files in it, the longest first."""
-    paths = (folder, folder.absolute(), resolved(folder))
+    paths = {folder, folder.absolute(), resolved(folder)}
+    with suppress(FileNotFoundError):  # the current folder may have been removed
+        here = Path.cwd()
+        for path in tuple(paths):
+            if path.is_relative_to(here):  # as a shell lists its files
+                paths.add(path.relative_to(here))
     found = {path.as_posix() for path in paths} - {".", "/"}
     return tuple(sorted(found, key=len, reverse=True))
 

@@ -436,6 +436,7 @@ class ReconstructionReport(Summarized):
             *self._extension_lines(),
             *self._missing_lines(),
             f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified",
+            *self._few_matches_lines(),
             *_some(f"by hand     {text}" for text in self.by_hand),
             *self._matching_lines(),
             *self._camera_lines(),
@@ -456,6 +457,15 @@ class ReconstructionReport(Summarized):
         """Return the warnings as pages and the terminal show them."""
         of_stages = (stage.warned for stage in self.stages)
         return texts_by_subject(itertools.chain.from_iterable(of_stages))
+
+    def _few_matches_lines(self) -> list[str]:
+        """Return what else ties a model of which too few pairs are verified."""
+        largest = largest_of(self.models)
+        num_needed = len(largest.registered_names) - 1
+        is_tied = self.num_verified_pairs >= num_needed
+        if is_tied or self.extended or largest.tie_points:
+            return []
+        return ["            others have fewer matches, which agree beyond chance"]
 
     def _extension_lines(self) -> list[str]:
         if not self.extended:

@@ -25,6 +25,7 @@ from colmap_affrect.project.report import (
     ModelSummary,
     ReconstructionReport,
     largest_of,
+    probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.photographs import PhotographReport, quality_of
@@ -124,7 +125,7 @@ class RunReport(ReconstructionReport):
         model = largest_of(self.models)
         for name in self.registered_names:
             chance = model.probabilities.get(name)
-            percent = "" if chance is None else f"{chance:.0%}"
+            percent = "" if chance is None else _text(probability_text(chance))
             doubts = (*model.doubtful.get(name, ()), *model.unsure.get(name, ()))
             quality = quality_of(name, model)
             why = f"{quality}: {text_of(doubts)}" if doubts else quality

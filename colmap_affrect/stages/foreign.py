@@ -237,7 +237,7 @@ def _write_given_matches(
         if database.exists_keypoints(image.image_id)
     ]
     with (
-        given_matches(foreign.matches_path, names) as found,
+        given_matches(foreign.matches_path, names, foreign.image_path) as found,
         context.progress.stage("matches", len(found.pairs), "pairs") as advance,
     ):
         write_given_matches(

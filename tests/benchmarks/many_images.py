@@ -239,15 +239,19 @@ def measure(folder: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
     out = folder / f"run-{count}"
     width, height = IMAGE_SIZE
     parameters = f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{width / 2},{height / 2}"
-    command = ["run", "--quiet", "--image-path", str(folder / "images")]
-    command += ["--image-list-path", str(listed), "--output-path", str(out)]
-    command += ["--camera-mode", "single", "--camera-model", "PINHOLE"]
-    command += ["--camera-params", parameters, *options]
+    command = [
+        *("run", "--quiet", "--image-path", str(folder / "images")),
+        *("--image-list-path", str(listed), "--output-path", str(out)),
+        *("--camera-mode", "single", "--camera-model", "PINHOLE"),
+        *("--camera-params", parameters, *options),
+    ]
     costs_path = folder / "costs-of-run.json"
     found: dict[str, Any] = {"num_images": count}
     for kind, more in (("first", ["--overwrite"]), ("idle", [])):
-        own = [sys.executable, str(Path(__file__).resolve())]
-        own += ["--output-path", str(folder), "--measure-run", str(costs_path), "--"]
+        own = [
+            *(sys.executable, str(Path(__file__).resolve())),
+            *("--output-path", str(folder), "--measure-run", str(costs_path), "--"),
+        ]
         begin_s = time.monotonic()
         subprocess.run([*own, *command, *more], check=True, stdout=subprocess.DEVNULL)
         found[f"{kind}_wall_s"] = time.monotonic() - begin_s

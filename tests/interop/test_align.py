@@ -65,23 +65,31 @@ def test_control_points_give_scale_rotation_and_place(tmp_path: Path) -> None:
     assert not (tmp_path / "new" / "georeference.json").exists()
 
 
-def test_positions_on_earth_become_metres_east_north_and_up(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("origin", "precision_m"), [
+    (ORIGIN, 1e-4), ((-17.0, 180.0, 5.0), 1e-4), ((-90.0, 77.0, 2800.0), 0.01),
+])  # fmt: skip
+def test_positions_on_earth_become_metres_east_north_and_up(
+    tmp_path: Path, origin: tuple[float, ...], precision_m: float
+) -> None:
+    """Also on both sides of 180 degrees, and round a pole, where latitudes are less precise."""
     model = write_model(tmp_path / "model")
     table = tmp_path / "positions.csv"
     rows = ["name,latitude,longitude,altitude"]
     for name, place in true_centers(model).items():
-        rows.append(",".join([name, *map(repr, on_earth(place, ORIGIN))]))
+        rows.append(",".join([name, *map(repr, on_earth(place, origin))]))
     table.write_text("\n".join(rows))
     done = align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
-    assert done.scale == pytest.approx(2.5, rel=1e-5)
+    assert done.scale == pytest.approx(2.5, rel=precision_m)
     new = pycolmap.Reconstruction(tmp_path / "new")
     kept = json.loads((tmp_path / "new" / "georeference.json").read_text())
-    origin = tuple(kept[key] for key in ("latitude", "longitude", "altitude"))
+    found_origin = tuple(kept[key] for key in ("latitude", "longitude", "altitude"))
+    middle = WGS84.ellipsoid_to_ecef(np.array([origin, found_origin]))
+    assert np.linalg.norm(middle[0] - middle[1]) < 100.0
     for name, true in true_centers(model).items():
-        expected = on_earth(true, ORIGIN)
-        found = on_earth(centers(new)[name], origin)
-        np.testing.assert_allclose(found, expected, atol=1e-4)
-        np.testing.assert_allclose(found[:2], expected[:2], atol=1e-8)
+        expected = WGS84.ellipsoid_to_ecef(np.array([on_earth(true, origin)]))
+        found = on_earth(centers(new)[name], found_origin)
+        found_in_space = WGS84.ellipsoid_to_ecef(np.array([found]))
+        np.testing.assert_allclose(found_in_space, expected, atol=precision_m)
 
 
 def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> None:
@@ -197,6 +205,26 @@ def test_positions_that_are_wrong_are_left_out_and_named(
     assert left_out == wrong.keys()
     new = centers(pycolmap.Reconstruction(tmp_path / "new"))
     assert max(np.linalg.norm(center) for center in new.values()) < 300
+
+
+@pytest.mark.parametrize(("error_m", "is_said"), [(50.0, False), (300.0, True)])
+def test_places_that_are_off_by_as_much_as_they_spread_are_doubtful(
+    tmp_path: Path, *, error_m: float, is_said: bool
+) -> None:
+    """As GPS of photographs of something small; these spread 150 m."""
+    ring(tmp_path / "model")
+    rng = np.random.default_rng(1)
+    model = pycolmap.Reconstruction(tmp_path / "model")
+    rows = ["name,x,y,z"]
+    for name, place in true_centers(model).items():
+        wrong = 20.0 * place + rng.normal(0.0, error_m, 3)
+        rows.append(",".join([name, *map(str, wrong)]))
+    table = tmp_path / "positions.csv"
+    table.write_text("\n".join(rows))
+    done = align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
+    assert 100.0 < done.spread < 900.0
+    assert done.contradicts_itself == is_said
+    assert ("doubtful" in done.summary()) == is_said
 
 
 PLACES = np.array(

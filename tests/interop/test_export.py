@@ -264,6 +264,9 @@ def test_text_is_refused_where_colmap_could_not_read_the_names(
     assert not (tmp_path / "out").exists()
     assert [*export(tmp_path / "model", tmp_path / "out")] == ["ply", "cameras"]
     assert "text: left out, COLMAP could not read back the names" in caplog.text
+    with pytest.raises(OptionError, match="mvsnet: COLMAP could not read back"):
+        export(tmp_path / "model", tmp_path / "out2", "mvsnet", image_path=tmp_path)
+    assert not (tmp_path / "out2").exists()
 
 
 @pytest.mark.usefixtures("model")

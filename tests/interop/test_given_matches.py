@@ -86,6 +86,51 @@ def test_files_of_deep_image_matching_are_read(files: Files) -> None:
     assert files.pairs() == {PAIR: [[0, 3], [2, 1]]}
 
 
+def two_folders(tmp_path: Path, names: list[str]) -> Path:
+    """Write photographs and features of these names; return where matches go."""
+    write_photos(tmp_path / "photos", names)
+    write_h5(tmp_path / "f.h5", {name: hloc_group(3) for name in names})
+    return tmp_path / "matches"
+
+
+def import_two_folders(tmp_path: Path, matches: Path) -> int:
+    paths = (tmp_path / "photos", tmp_path / "f.h5", matches, tmp_path / "new.db")
+    return import_h5(*paths, skip_verification=True).num_pairs
+
+
+@pytest.mark.parametrize("kind", ["hloc", "hloc, older", "deep-image-matching", "list"])
+def test_names_without_folders_are_read_where_one_image_is_called_so(
+    tmp_path: Path, kind: str
+) -> None:
+    def write(path: Path) -> None:
+        if kind == "list":
+            path.write_text("x.png y.png\n0 2\n", encoding="utf-8")
+            return
+        nested = {"x.png": {"y.png": np.array([[0, 2]])}}
+        separator = "_" if "older" in kind else "/"
+        flat = {f"x.png{separator}y.png": match_group([2, -1, -1])}
+        write_h5(path, nested if kind == "deep-image-matching" else flat)
+
+    clear = two_folders(tmp_path / "clear", ["a/x.png", "b/y.png"])
+    write(clear)
+    assert import_two_folders(clear.parent, clear) == 1
+    open_to_both = two_folders(tmp_path / "both", ["a/x.png", "b/x.png", "b/y.png"])
+    write(open_to_both)
+    with pytest.raises(StoreError, match=r"images that have (no )?features"):
+        import_two_folders(open_to_both.parent, open_to_both)
+
+
+def test_whole_names_come_before_names_without_folders_that_look_like_them(
+    tmp_path: Path,
+) -> None:
+    matches = two_folders(tmp_path, ["a.png", "x/y.png", "z/x-y.png"])
+    write_h5(matches, {"x-y.png/a.png": match_group([2, -1, -1])})
+    assert import_two_folders(tmp_path, matches) == 1
+    with open_database(tmp_path / "new.db") as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        assert database.exists_matches(ids["a.png"], ids["x/y.png"])
+
+
 LIST = """
 a.png sub/b c.png
 0 3
@@ -118,6 +163,31 @@ def test_lists_of_matches_importer_are_read(files: Files, match_type: str) -> No
     assert found == ([[0, 3], [2, 1]] if match_type == "inliers" else [])
     if match_type == "inliers":
         assert geometry.config == pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+
+
+@pytest.mark.parametrize("line", [
+    "{folder}/a.png {folder}/sub/b c.png", "{folder}\\a.png {folder}\\sub\\b c.png",
+    ".\\a.png .\\sub\\b c.png", "photos/a.png\tphotos/sub/b c.png", "a.png,sub/b c.png,0.93",
+])  # fmt: skip
+def test_lists_of_matches_may_name_paths_into_the_folder_as_lists_of_pairs(
+    files: Files, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    monkeypatch.chdir(files.photos.parent)
+    files.matches = files.folder / "matches.txt"
+    named = line.format(folder=files.photos)
+    files.matches.write_bytes(f"{named}\r\n0 3\r\n2 1\r\n\r\n".encode())
+    files.import_all()
+    assert files.pairs() == {PAIR: [[0, 3], [2, 1]]}
+
+
+def test_lists_of_matches_in_another_encoding_are_refused_with_advice(
+    files: Files,
+) -> None:
+    files.matches = files.folder / "matches.txt"
+    files.matches.write_text(LIST, encoding="utf-16")
+    with pytest.raises(OptionError, match=r"no text in UTF-8; save it as UTF-8"):
+        files.import_all()
+    assert not files.database.exists()
 
 
 @pytest.mark.parametrize(

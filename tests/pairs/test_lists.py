@@ -161,7 +161,20 @@ def test_relative_folder_of_photographs_is_found_in_absolute_paths(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     pair_list.write_text(f"{tmp_path}/photos/a.png photos/b.png\n", encoding="utf-8")
-    assert list(read_pairs(pair_list, NAMES, Path("photos"))) == [("a.png", "b.png")]
+    for folder in (Path("photos"), tmp_path / "photos"):  # a run has the whole path
+        assert list(read_pairs(pair_list, NAMES, folder)) == [("a.png", "b.png")]
+
+
+def test_a_current_folder_that_is_gone_keeps_no_list_from_being_read(
+    pair_list: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    here.rmdir()
+    pair_list.write_text(f"{tmp_path}/photos/a.png b.png\n", encoding="utf-8")
+    found = read_pairs(pair_list, NAMES, tmp_path / "photos")
+    assert list(found) == [("a.png", "b.png")]
 
 
 @pytest.mark.parametrize("text", [

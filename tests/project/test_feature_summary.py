@@ -68,18 +68,13 @@ def known(store: FeatureStore) -> dict[str, object]:
     }
 
 
-def forget() -> None:
-    """Forget what this process has read, as another one would not know it."""
-    feature_store._forget_summaries()
-
-
 def test_summaries_say_to_the_last_bit_what_the_features_say(
     store: FeatureStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = known(store)
     assert set(store.line_findings()) == set(NAMES[:2])
     store.keep_summaries()
-    forget()
+    feature_store._forget_summaries()
     monkeypatch.setattr("colmap_affrect.project.feature_store.entries_of", None)
     monkeypatch.setattr(FeatureStore, "lines_of", None)
     assert known(store) == before
@@ -100,7 +95,7 @@ def test_features_that_somebody_else_has_written_have_no_summaries(
     other = FeatureStore(store.path.with_name("other.h5"))
     other.write("b.png", some_features(9), SIZE)
     other.path.replace(store.path)
-    forget()
+    feature_store._forget_summaries()
     assert store.num_keypoints() == {"b.png": 9}
     assert not store.line_findings()
 
@@ -127,5 +122,5 @@ def test_summaries_that_are_damaged_or_of_another_version_do_not_count(
     else:
         values["images"][NAMES[0]][1] = "many"
         write_sealed(path, json.dumps(values))
-    forget()
+    feature_store._forget_summaries()
     assert known(store) == before

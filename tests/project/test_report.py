@@ -15,6 +15,7 @@ from colmap_affrect.project.report import (
     Bridge,
     ModelSummary,
     ReconstructionReport,
+    Residual,
 )
 from colmap_affrect.project.stage_report import StageReport
 
@@ -150,6 +151,21 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "extract 1.2  map 0.5",
     ):
         assert part in text
+
+
+@pytest.mark.parametrize(("num_verified", "is_said"), [(0, True), (1, False)])
+def test_summary_says_what_ties_a_model_of_fewer_verified_pairs_than_images(
+    num_verified: int, *, is_said: bool
+) -> None:
+    """Two images need one pair; those of 7 to 14 matches are not counted as verified."""
+    models = (replace(REPORT.models[0], tie_points=()),)
+    report = replace(
+        REPORT, models=models, extended=(), num_verified_pairs=num_verified
+    )
+    assert ("others have fewer matches" in report.summary()) == is_said
+    mark = Residual(point="A", image="a.png", error_px=1.0)
+    by_hand = (replace(REPORT.models[0], tie_points=(mark,)),)
+    assert "others have fewer" not in replace(report, models=by_hand).summary()
 
 
 def test_summary_says_where_exif_is_wrong_or_needs_the_size_of_the_sensor() -> None:
