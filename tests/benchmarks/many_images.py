@@ -288,7 +288,13 @@ def main() -> None:
     """Print the tables."""
     parser = parser_of(__doc__)
     parser.add_argument("--output-path", type=Path, required=True)
-    parser.add_argument("--num-images", type=int, nargs="+", default=[1000])
+    parser.add_argument(
+        "--num-images",
+        type=int,
+        nargs="+",
+        default=[1000],
+        help="numbers of images, each of which is run on",
+    )
     parser.add_argument("--measure-run", type=Path, help="JSON file; runs OPTIONS once")
     parser.add_argument(
         "options", nargs="*", help="of run, after --; default: --pairs retrieval"
@@ -305,8 +311,9 @@ def main() -> None:
     for count in counts:
         options = arguments.options or ("--pairs", "retrieval")
         found.append(measure(arguments.output_path, count, options))
-        text = json.dumps(found, indent=1)
-        (arguments.output_path / "costs.json").write_text(text, encoding="utf-8")
+        (arguments.output_path / "costs.json").write_text(
+            json.dumps(found, indent=1), encoding="utf-8"
+        )
     header = ("stage", *[f"{count} images" for count in counts], "growth")
     for kind in ("first", "idle"):
         print(f"{kind} run\n\n{table(header, rows_of(found, kind))}")
