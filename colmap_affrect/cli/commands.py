@@ -1,7 +1,7 @@
 """What each command does with its options: one library function and its result printed.
 
 Every command takes the parsed options, and raises what is wrong. This is imported when a command
-runs: ``--help`` loads no heavy package.
+runs: ``--help`` loads no heavy package. What one command alone needs, that imports.
 """
 
 import argparse
@@ -10,18 +10,12 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from colmap_affrect import doctor as examination
 from colmap_affrect import pipeline
 from colmap_affrect.cli import given
-from colmap_affrect.colmap import old_databases
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import fill_descriptors
-from colmap_affrect.comparison import compare as comparing
-from colmap_affrect.comparison import tables
-from colmap_affrect.comparison.method_run import CompareOptions
-from colmap_affrect.comparison.methods import parse_methods
-from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.errors import (
     AffrectError,
     ImageError,
@@ -30,21 +24,13 @@ from colmap_affrect.errors import (
     OptionError,
     such_as,
 )
-from colmap_affrect.evaluation import evaluate as evaluating
-from colmap_affrect.evaluation.evaluate import EvaluateOptions
-from colmap_affrect.evaluation.truths import ScoreOptions
 from colmap_affrect.features import weights as files
-from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.photographs import (
     CameraOptions,
     MaskOptions,
     Photographs,
     list_images,
 )
-from colmap_affrect.interop import align as aligning
-from colmap_affrect.interop import export as exporting
-from colmap_affrect.interop import hdf5
-from colmap_affrect.interop import panoramas as panorama_views
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import described_toml
 from colmap_affrect.pipeline import single_stages
@@ -52,18 +38,16 @@ from colmap_affrect.progress import Progress, show
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
-from colmap_affrect.report import page_server
-from colmap_affrect.report.inspection import inspect_image
-from colmap_affrect.report.line_pictures import report_lines
-from colmap_affrect.report.pairs import draw_pair
 from colmap_affrect.report.run_report import RunReport
-from colmap_affrect.report.two_runs import write_two_runs
 from colmap_affrect.session.run_options import RunOptions
 from colmap_affrect.stages.extract import extract as extract_features
 from colmap_affrect.stages.match import match as match_pairs
 from colmap_affrect.stages.one_image import prepare
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
+
+if TYPE_CHECKING:
+    from colmap_affrect.comparison.results import Comparison
 
 MAX_PORT = 65_535  # of TCP (theory)
 
@@ -152,6 +136,11 @@ def map(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
+    from colmap_affrect.comparison import compare as comparing
+    from colmap_affrect.comparison import tables
+    from colmap_affrect.comparison.method_run import CompareOptions
+    from colmap_affrect.comparison.methods import parse_methods
+
     comparison = comparing.compare(
         options.image_path,
         options.output_path,
@@ -173,7 +162,7 @@ def compare(options: argparse.Namespace) -> None:
     )
 
 
-def _refuse_failed_methods(comparison: Comparison, where: Path) -> None:
+def _refuse_failed_methods(comparison: "Comparison", where: Path) -> None:
     """End with an error if a method failed, or none found a model."""
     failed = [method.name for method in comparison.methods if method.failed]
     if failed:
@@ -184,6 +173,11 @@ def _refuse_failed_methods(comparison: Comparison, where: Path) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
+    from colmap_affrect.comparison.methods import parse_methods
+    from colmap_affrect.evaluation import evaluate as evaluating
+    from colmap_affrect.evaluation.evaluate import EvaluateOptions
+    from colmap_affrect.evaluation.truths import ScoreOptions
+
     evaluation = evaluating.evaluate(
         options.protocol,
         options.dataset_path,
@@ -206,6 +200,8 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def import_h5(options: argparse.Namespace) -> None:
+    from colmap_affrect.interop import hdf5
+
     report = hdf5.import_h5(
         options.image_path,
         options.features_path,
@@ -221,6 +217,8 @@ def import_h5(options: argparse.Namespace) -> None:
 
 
 def panoramas(options: argparse.Namespace) -> None:
+    from colmap_affrect.interop import panoramas as panorama_views
+
     models = panorama_views.reconstruct_panoramas(
         options.image_path,
         options.target_path,
@@ -238,6 +236,8 @@ def panoramas(options: argparse.Namespace) -> None:
 
 
 def export_h5(options: argparse.Namespace) -> None:
+    from colmap_affrect.interop import hdf5
+
     report = hdf5.export_h5(
         options.database_path,
         options.features_path,
@@ -248,6 +248,8 @@ def export_h5(options: argparse.Namespace) -> None:
 
 
 def export_database(options: argparse.Namespace) -> None:
+    from colmap_affrect.colmap import old_databases
+
     number = old_databases.export_database(
         options.path, options.database_path, descriptors=bool(options.descriptors)
     )
@@ -261,6 +263,8 @@ def export_database(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
+    from colmap_affrect.interop import export as exporting
+
     written = exporting.export(
         options.model_path,
         options.target_path,
@@ -274,6 +278,8 @@ def export(options: argparse.Namespace) -> None:
 
 
 def align(options: argparse.Namespace) -> None:
+    from colmap_affrect.interop import align as aligning
+
     reference = aligning.Reference(
         gps_database=options.gps,
         positions_path=options.positions,
@@ -285,6 +291,8 @@ def align(options: argparse.Namespace) -> None:
 
 
 def doctor(options: argparse.Namespace) -> int | None:
+    from colmap_affrect import doctor as examination
+
     diagnosis = examination.diagnose(options.path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return 1 if diagnosis.num_errors else None
@@ -348,6 +356,8 @@ def _refuse_failures(failures: Iterable[str], options: argparse.Namespace) -> No
 
 
 def inspect(options: argparse.Namespace) -> None:
+    from colmap_affrect.report.inspection import inspect_image
+
     recipe = given.recipe(options)
     if not options.image.is_file():
         why = "is a folder" if options.image.is_dir() else "no such file"
@@ -364,12 +374,16 @@ def inspect(options: argparse.Namespace) -> None:
 
 
 def lines(options: argparse.Namespace) -> None:
+    from colmap_affrect.report.line_pictures import report_lines
+
     found = report_lines(options.photographs, options.target_path)
     show(found.to_json() if options.json else found.summary())
     _refuse_failures(found.failures, options)
 
 
 def serve(options: argparse.Namespace) -> None:
+    from colmap_affrect.report import page_server
+
     by_hand = ByHand(rejected=tuple(options.rejected), left_out=tuple(options.left_out))
     port = page_server.PORT if options.port is None else options.port
     if port > MAX_PORT:
@@ -382,6 +396,8 @@ def serve(options: argparse.Namespace) -> None:
 
 
 def show_runs(options: argparse.Namespace) -> None:
+    from colmap_affrect.report.two_runs import write_two_runs
+
     page = write_two_runs(
         options.before, options.after, options.page_path, options.progress
     )
@@ -389,6 +405,8 @@ def show_runs(options: argparse.Namespace) -> None:
 
 
 def show_pair(options: argparse.Namespace) -> None:
+    from colmap_affrect.report.pairs import draw_pair
+
     photographs = given.folder("image-path", options.image_path)
     show(
         draw_pair(options.path, tuple(options.pair), photographs, options.picture_path)
@@ -396,6 +414,8 @@ def show_pair(options: argparse.Namespace) -> None:
 
 
 def convert(options: argparse.Namespace) -> None:
+    from colmap_affrect.images.conversion import convert_images
+
     report = convert_images(options.image_path, options.target_path, options.progress)
     show(report.summary())
     if report.failures:

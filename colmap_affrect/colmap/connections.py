@@ -19,11 +19,21 @@ def connected_parts(
     pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()
 ) -> list[set[T]]:
     """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    listed = list(pairs)
+    partners = {image: {image} for image in images}
+    for first, second in listed:
+        partners.setdefault(first, {first}).add(second)
+        partners.setdefault(second, {second}).add(first)
+    if not partners:
+        return []
+    most = max(partners.values(), key=len)
+    if len(most) == len(partners):
+        return [most]  # one image is tied to all others
     import networkx  # which takes as long to load as numpy and OpenCV together
 
     graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
+    graph.add_nodes_from(partners)
+    graph.add_edges_from(listed)
     return sorted(
         networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
     )
@@ -36,11 +46,12 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
     for first, second in listed:
         partners[first].add(second)
         partners[second].add(first)
-    may_be_alone = [
-        partners[first].isdisjoint(partners[second]) for first, second in listed
-    ]
-    if not any(may_be_alone):
-        return []  # a third image ties each pair, too
+    between_parts = list[tuple[T, T]]()
+    for first, second in listed:
+        if len(partners[first]) > 1 and len(partners[second]) > 1:
+            between_parts.append((first, second))
+    if all(_is_tied_otherwise(*pair, partners) for pair in between_parts):
+        return []
     import networkx
 
     graph: networkx.Graph[T] = networkx.Graph()
@@ -50,6 +61,21 @@ def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:
         if len(partners[first]) > 1 and len(partners[second]) > 1:
             found.append((min(first, second), max(first, second)))
     return found
+
+
+def _is_tied_otherwise(first: T, second: T, partners: Mapping[T, set[T]]) -> bool:
+    """Tell whether a third image ties two images, too, or a third and a fourth one.
+
+    Args:
+        first: Of the images.
+        second: The other one.
+        partners: Of each image those that it is tied to.
+    """
+    if not partners[first].isdisjoint(partners[second]):
+        return True
+    others = partners[second] - {first}
+    thirds = partners[first] - {second}
+    return any(not others.isdisjoint(partners[third]) for third in thirds)
 
 
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:

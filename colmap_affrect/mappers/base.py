@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.geometry.lines import LineCamera
     from colmap_affrect.mappers.existing import ExistingModel
+    from colmap_affrect.mappers.other_cameras import OtherCameras
     from colmap_affrect.mappers.pair_graph import PairGraph
     from colmap_affrect.project.reasons import Doubt
     from colmap_affrect.project.report import Bridge
@@ -130,6 +131,9 @@ class MappedModel:
     axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
     """By the names of images: how far rotations change where principal points that points
     contradict are freed, though that makes no better model."""
+    other_cameras: OtherCameras | None = None
+    """What a camera for each image would make of a model whose images share some by assumption, or
+    one camera where they have their own."""
     apart: Mapping[str, Doubt] = field(default_factory=dict)
     """By the names of images that were in the same model, why they are not in this one."""
     motion_share: float = 1.0

@@ -5,7 +5,7 @@ with one geometry, and third images confirm them one by one, chance does not exp
 """
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -92,13 +92,36 @@ def _few_raw_matches(
 ) -> dict[Ids, Indices]:
     """Return the raw matches, each once, of pairs that have few and are not verified."""
     found = {}
+    frames = _Frames(database, verified)
     for pair_id, matches in zip(*database.read_all_matches(), strict=True):
         ids = pycolmap.pair_id_to_image_pair(pair_id)
-        if ids not in verified and MIN_FEW <= len(matches) <= MAX_RAW:
+        is_known = ids in verified or frames.are_tied(ids)
+        if not is_known and MIN_FEW <= len(matches) <= MAX_RAW:
             each_once = np.unique(np.asarray(matches, np.int64), axis=0)
             if len(each_once) >= MIN_FEW:
                 found[ids] = each_once
     return found
+
+
+class _Frames:
+    """What rigs of several sensors took at once: all images of a frame have one pose."""
+
+    def __init__(self, database: pycolmap.Database, verified: Collection[Ids]) -> None:
+        """Take the frames of a database, and the pairs of its images that tie them."""
+        images = database.read_all_images()
+        self._frame_of = {image.image_id: image.frame_id for image in images}
+        self._num_images = Counter(self._frame_of.values())
+        self._tied = {self._frames_of(ids) for ids in verified}
+
+    def are_tied(self, ids: Ids) -> bool:
+        """Tell whether other images tie the frames of two images, or both are of one frame."""
+        frames = self._frames_of(ids)
+        if min(self._num_images[frame] for frame in frames) < 2:
+            return False
+        return frames in self._tied or len(frames) == 1
+
+    def _frames_of(self, ids: Ids) -> frozenset[int]:
+        return frozenset(self._frame_of[image_id] for image_id in ids)
 
 
 def _geometry(

@@ -6,7 +6,7 @@ length fits, and where it lowers the cost, a given one is wrong.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, EarlyStop
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import (
+    LYING_LINES,
     CameraPrior,
     camera_priors,
     with_distortion_of,
@@ -24,6 +25,11 @@ from colmap_affrect.mappers.focal_uncertainty import (
     focal_sigmas,
 )
 from colmap_affrect.mappers.model_score import num_occupied_cells
+from colmap_affrect.mappers.other_cameras import (
+    NO_OTHER_CAMERAS,
+    OtherCameras,
+    pose_turns_deg,
+)
 from colmap_affrect.mappers.pair_graph import cameras_of, has_rigs
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -35,6 +41,9 @@ MAX_GROWTH = 1.0  # that of a known focal length: more makes none surer; theory
 FREE_SIGMA = 1.0
 # Of the logarithm of a given focal length, from which on another one is named; display
 MIN_MOVE = 0.1
+WRONG_SHARE = LYING_LINES
+"""Of given focal lengths, those of another lens or of enlarged parts, before points are seen: the
+same as of lines."""
 # Of a trial: three times as many change growths by 4 % at most (measured)
 NUM_ITERATIONS = 100
 # More cameras than that are tried several at once, to save time; resource
@@ -183,28 +192,35 @@ def _growths(trials: _FocalTrials, camera_ids: Sequence[int]) -> dict[int, float
     return found
 
 
-def fitting_focals(
+@dataclass(frozen=True)
+class FreedFocals:
+    """What becomes of a model where its given focal lengths are free."""
+
+    fitting_px: Mapping[int, float] = field(default_factory=dict)
+    """By camera id the focal lengths that fit better than given ones, where that is clear."""
+    other: OtherCameras = NO_OTHER_CAMERAS  # which may be right, where it is not
+
+
+def freed_focals(
     model: pycolmap.Reconstruction,
     task: MappingTask,
     priors: Mapping[int, CameraPrior],
-) -> dict[int, float]:
-    """Find focal lengths that fit better than those that the user gave.
+) -> FreedFocals:
+    """Free the focal lengths that the user gave, each or by one factor all together.
+
+    They are clearly wrong where that lowers the cost by more than free parameters are worth (BIC):
+    half the logarithm of the number of observations each, of which those in one cell of an image
+    count once.
 
     Args:
         model: It stays as it is.
         task: Says which focal lengths were given.
         priors: Priors of the focal lengths, by camera id.
-
-    Returns:
-        The focal lengths in px by id of the camera. Empty where freeing the given ones, each or by
-        one factor all together, lowers the cost by less than free parameters are worth (BIC): half
-        the logarithm of the number of observations each, of which those in one cell of an image
-        count once.
     """
     recorded = priors.keys() & task.cameras.keys()
     given = {key for key in recorded if "focal" in task.cameras[key].given}
     if not given or not _is_tried(model):
-        return {}
+        return FreedFocals()
     # A wrong focal length is made up for by distortion, where that was free.
     constant = frozenset(key for key in given if task.cameras[key].is_all_given)
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=not constant)
@@ -216,18 +232,35 @@ def fitting_focals(
     free_adjuster = Adjuster(
         priors=_with_free_focals(priors, given), noise_px=NOISE_PX, refining=refining
     )
-    free_model = with_fewer_points(model)
-    gain = given_cost - free_adjuster.adjust(free_model, FINAL)
-    if _is_worth_parameters(gain, len(given), given_model):
-        return _moved_focals(free_model, priors, given)
-    if len(given) == 1:
-        return {}
-    common_model = with_fewer_points(model)
-    common_cost = adjust_common_factor(common_model, free_adjuster, sorted(given))
-    # What is wrong in the same way everywhere is one parameter.
-    if _is_worth_parameters(given_cost - common_cost, 1, given_model):
-        return _moved_focals(common_model, priors, given)
-    return {}
+    freed_model = with_fewer_points(model)
+    gain = given_cost - free_adjuster.adjust(freed_model, FINAL)
+    is_wrong = _is_worth_parameters(gain, len(given), given_model)
+    if not is_wrong and len(given) > 1:
+        # What is wrong in the same way everywhere is one parameter.
+        freed_model = with_fewer_points(model)
+        cost = adjust_common_factor(freed_model, free_adjuster, sorted(given))
+        gain = given_cost - cost
+        is_wrong = _is_worth_parameters(gain, 1, given_model)
+    fitting_px = _moved_focals(freed_model, priors, given) if is_wrong else {}
+    return FreedFocals(fitting_px, _other_focals(given_model, freed_model, gain))
+
+
+def _other_focals(
+    model: pycolmap.Reconstruction, freed: pycolmap.Reconstruction, gain: float
+) -> OtherCameras:
+    """Return how likely freed focal lengths are, and how far poses turn with them.
+
+    Args:
+        model: With the given ones.
+        freed: The same with free ones.
+        gain: By what its cost is lower, in nats.
+    """
+    if not math.isfinite(gain):
+        return NO_OTHER_CAMERAS
+    log_odds = math.log(WRONG_SHARE / (1.0 - WRONG_SHARE)) + gain * _counted_share(
+        model
+    )
+    return OtherCameras(log_odds, pose_turns_deg(model, freed))
 
 
 def _with_free_focals(
@@ -250,10 +283,13 @@ def _is_worth_parameters(
         num_parameters: How many are free.
         model: Has the observations, of which those in one cell of an image count once.
     """
-    num_cells = num_independent(model)
-    worth = 0.5 * math.log(max(2, num_cells)) * num_parameters
-    counted_share = num_cells / max(1, model.compute_num_observations())
-    return gain * counted_share >= worth
+    worth = 0.5 * math.log(max(2, num_independent(model))) * num_parameters
+    return gain * _counted_share(model) >= worth
+
+
+def _counted_share(model: pycolmap.Reconstruction) -> float:
+    """Return the share of the observations that counts: those in one cell err together."""
+    return num_independent(model) / max(1, model.compute_num_observations())
 
 
 def _moved_focals(

@@ -144,7 +144,8 @@ def grid_cells(camera: pycolmap.Camera, points: Floats) -> Indices:
 
 def num_occupied_cells(camera: pycolmap.Camera, points: Floats) -> int:
     """Return how many cells of a grid over an image hold points, (N, 2) px."""
-    return len(np.unique(grid_cells(camera, points)))
+    cells = grid_cells(camera, points)
+    return int(np.count_nonzero(np.bincount(cells, minlength=GRID * GRID)))
 
 
 def pair_log_ratio(num_agreeing: float, num: float) -> float:

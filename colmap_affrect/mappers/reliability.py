@@ -15,6 +15,7 @@ from pathlib import Path
 
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import MAX_GROWTH, MIN_GROWTH
+from colmap_affrect.mappers.other_cameras import OtherPose
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
 from colmap_affrect.project.reasons import Doubt
 
@@ -32,6 +33,7 @@ CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (j
 # Inliers more that make the former less likely by a factor of e (judged)
 CHANCE_SCALE = 10.0
 MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit; paper
+MIN_SHARE = 1e-9  # of a probability, whose logarithm is taken; numeric
 MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by; numeric
 # Of the log odds: what takes less, half of the odds, is no reason to doubt; theory
 MIN_LOSS = 0.7
@@ -89,15 +91,6 @@ def _focal_observability_reason(_: ReliabilityFeatures) -> Doubt:
     return Doubt("focal_unknown")
 
 
-def _given_focal(features: ReliabilityFeatures) -> float:
-    return -float(features.fitting_focal_px > 0.0)
-
-
-def _given_focal_reason(features: ReliabilityFeatures) -> Doubt:
-    values = {"given_px": features.focal_px, "fitting_px": features.fitting_focal_px}
-    return Doubt("focal_contradicted", {**values})
-
-
 def _parallax(features: ReliabilityFeatures) -> float:
     return -max(features.pure_rotation_ratio, USUAL_ROTATION_RATIO)
 
@@ -127,7 +120,6 @@ TERMS: Mapping[str, Term] = {  # by their names in the file of coefficients
     "agreement": Term(_agreement_value, _agreement_reason),
     "three-view points": Term(_three_view_points, _three_view_points_reason),
     "focal observability": Term(_focal_observability, _focal_observability_reason),
-    "given focal length": Term(_given_focal, _given_focal_reason),
     "parallax": Term(_parallax, _parallax_reason),
     "mirrored copy": Term(_mirrored_copy, _mirrored_copy_reason),
     "focal spread": Term(_focal_spread, _focal_spread_reason),
@@ -231,9 +223,11 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
 def unfitted_factor(features: ReliabilityFeatures) -> float:
     """Return the factor of the probability by what the regression is not fitted to.
 
-    That is the pair which a photograph hangs on, and what noise leaves open.
+    That is the pair which a photograph hangs on, other cameras, and what noise leaves open.
     """
-    return _precision_factor(features) / (1.0 + _odds_of_two_scenes(features))
+    factor = _precision_factor(features) / (1.0 + _odds_of_two_scenes(features))
+    factor *= _share_with_other_cameras(features.with_free_focals)
+    return factor * _share_with_other_cameras(features.with_other_cameras)
 
 
 def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
@@ -246,6 +240,7 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
             "bridge_edge", {"num_inliers": num_inliers, "pair": features.cut_pair}
         )
         losses.append(_Loss(math.log1p(odds), edge))
+    losses += _losses_by_other_cameras(features)
     if features.direction_sigma_deg:
         share = share_within_limit(features.direction_sigma_deg)
         near = Doubt("near_others", {"sigma_deg": features.direction_sigma_deg})
@@ -255,6 +250,27 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
         unclear = Doubt("axis_unclear", {"turn_deg": features.axis_turn_deg})
         losses.append(_Loss(-math.log(share), unclear))
     return losses
+
+
+def _losses_by_other_cameras(features: ReliabilityFeatures) -> list[_Loss]:
+    """Return what is taken as other cameras may be right."""
+    doubt = Doubt("focal_unknown")
+    if features.fitting_focal_px:
+        given_px = features.focal_px
+        values = {"given_px": given_px, "fitting_px": features.fitting_focal_px}
+        doubt = Doubt("focal_contradicted", {**values})
+    by_focals = _share_with_other_cameras(features.with_free_focals)
+    by_others = _share_with_other_cameras(features.with_other_cameras)
+    other = features.with_other_cameras
+    turn = {"turn_deg": other.turn_deg}
+    assumed = Doubt("cameras_differ" if other.is_shared else "camera_shared", {**turn})
+    return [_Loss(-math.log(by_focals), doubt), _Loss(-math.log(by_others), assumed)]
+
+
+def _share_with_other_cameras(other: OtherPose) -> float:
+    """Return the probability that a pose is within the limit, by other cameras or not."""
+    is_near = share_within_limit(other.turn_deg)
+    return max(1.0 - other.probability * (1.0 - is_near), MIN_SHARE)
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:

@@ -4,7 +4,7 @@ See :mod:`colmap_affrect.mappers.reliability`.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +16,25 @@ from colmap_affrect.geometry.arrays import sampling_step
 from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation_ratio
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.camera_priors import camera_priors, with_distortion_of
+from colmap_affrect.mappers.camera_priors import (
+    camera_priors,
+    is_off_center,
+    with_distortion_of,
+)
 from colmap_affrect.mappers.direction_uncertainty import direction_sigmas_deg
-from colmap_affrect.mappers.focal_observability import fitting_focals, focal_growths
+from colmap_affrect.mappers.focal_observability import focal_growths, freed_focals
 from colmap_affrect.mappers.model_score import ModelScorer, pair_log_ratio
+from colmap_affrect.mappers.other_cameras import (
+    NO_OTHER_CAMERAS,
+    NO_OTHER_POSE,
+    OtherPose,
+)
 from colmap_affrect.mappers.pair_graph import (
     MAX_ERROR,
     MIN_NUM_MATCHES,
     MIN_SHARE,
     Ids,
+    PairGraph,
     VerifiedPair,
     cameras_of,
     graph_of,
@@ -45,6 +55,8 @@ MIN_TOLD = 0.03
 parts of photographs it is 0.15."""
 # Strongest pairs of a frame that are compared with a pure rotation; resource
 NUM_ROTATION_PAIRS = 4
+# The same of a frame that several pairs tie to another one, as those of rigs; resource
+NUM_RIG_ROTATION_PAIRS = 2
 MAX_ROTATION_PAIRS = 300  # the same of a model, to save time; resource
 MIN_MIRRORED_SHARE = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
@@ -84,6 +96,10 @@ class ReliabilityFeatures:
     axis_turn_deg: float = 0.0
     """How far its rotations to others change with free principal points, where points contradict
     those that are constant and nothing tells where they are."""
+    with_free_focals: OtherPose = NO_OTHER_POSE
+    """Its pose where given focal lengths are free."""
+    with_other_cameras: OtherPose = NO_OTHER_POSE
+    """Its pose where images that share a camera by assumption have their own, or the reverse."""
 
 
 class _ModelContext:
@@ -161,7 +177,8 @@ def features_of(
     num_three_view_points = num_long_tracks(context.model, context.viewpoint_of)
     rotation_ratios = _rotation_ratios(context)
     originals = _mirrored_originals(context)
-    fitting_focals_px = fitting_focals(context.model, task, context.priors)
+    freed = freed_focals(context.model, task, context.priors)
+    other_cameras = mapped.other_cameras or NO_OTHER_CAMERAS
     focal_spreads = _focal_spreads(context, growths)
     tie_points = tie_points_of(task, context.graph)
     log_odds = tie_point_log_odds(tie_points.residuals(context.model))
@@ -182,7 +199,7 @@ def features_of(
             num_three_view_points=num_three_view_points[image_id],
             focal_growth=growths.get(key, 1.0),
             focal_px=float(camera.mean_focal_length()),
-            fitting_focal_px=fitting_focals_px.get(key, 0.0),
+            fitting_focal_px=freed.fitting_px.get(key, 0.0),
             pure_rotation_ratio=_pure_rotation_ratio(
                 context, image_id, rotation_ratios
             ),
@@ -193,6 +210,8 @@ def features_of(
             num_cut_pair_inliers=len(cut_pair.matches) if cut_pair else 0,
             direction_sigma_deg=directions_deg.get(image_id, 0.0),
             axis_turn_deg=mapped.axis_turns_deg.get(names[image_id], 0.0),
+            with_free_focals=freed.other.pose_of(names[image_id]),
+            with_other_cameras=other_cameras.pose_of(names[image_id]),
         )
     return found
 
@@ -225,8 +244,7 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
     """Return the share of matches that a rotation explains, of the strongest pairs of frames."""
     strongest = dict[Ids, VerifiedPair]()
     for pairs in context.pairs_of_frames.values():
-        ranked = sorted(pairs, key=lambda pair: -len(pair.matches))
-        for pair in ranked[:NUM_ROTATION_PAIRS]:
+        for pair in _strongest_to_frames(context, pairs):
             strongest[pair.ids] = pair
     found = {}
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
@@ -236,6 +254,27 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
         points1, points2 = context.graph.points(pair)
         found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
     return found
+
+
+def _strongest_to_frames(
+    context: _ModelContext, pairs: Sequence[VerifiedPair]
+) -> list[VerifiedPair]:
+    """Return the strongest pairs of a frame with others.
+
+    Rigs take several images at once: all pairs of two frames tell the same of how they moved.
+
+    Args:
+        context: Of the model.
+        pairs: Of the frame.
+    """
+    found = dict[frozenset[int], VerifiedPair]()
+    is_of_rig = False
+    for pair in sorted(pairs, key=lambda pair: -len(pair.matches)):
+        frames = frozenset(map(context.frame_of, pair.ids))
+        is_of_rig = is_of_rig or frames in found
+        found.setdefault(frames, pair)
+    most = NUM_RIG_ROTATION_PAIRS if is_of_rig else NUM_ROTATION_PAIRS
+    return list(found.values())[:most]
 
 
 def _pure_rotation_ratio(
@@ -294,6 +333,8 @@ def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
     step = sampling_step(len(graph.pairs), MAX_MIRRORED_PAIRS)
     for pair in graph.pairs[::step]:
         first, second = pair.ids
+        if _is_of_rig(graph, first) and _is_of_rig(graph, second):
+            continue  # prints and scans are mirrored, what a rig takes is not
         share = mirrored_share(
             graph.keypoints[first], graph.keypoints[second], graph.sizes(pair.ids)
         )
@@ -302,13 +343,22 @@ def _mirrored_pairs(context: _ModelContext) -> list[Ids]:
     return found
 
 
+def _is_of_rig(graph: PairGraph, image_id: int) -> bool:
+    """Tell whether a rig of several sensors took an image."""
+    frame = graph.cache.frames[graph.cache.images[image_id].frame_id]
+    return bool(graph.cache.rigs[frame.rig_id].num_sensors() > 1)
+
+
 def _focal_spreads(
     context: _ModelContext, growths: Mapping[int, float]
 ) -> dict[Size, float]:
-    """Return the longest by the shortest focal length that the model tells, by image size."""
+    """Return the longest by the shortest focal length that the model tells, by image size.
+
+    Of cameras whose principal point was freed, parts of photographs have nothing wrong.
+    """
     focals_px: defaultdict[Size, list[float]] = defaultdict(list)
     for key, camera in context.used_cameras.items():
-        if growths.get(key, 0.0) >= MIN_TOLD:
+        if growths.get(key, 0.0) >= MIN_TOLD and not is_off_center(camera):
             focal_px = max(camera.mean_focal_length(), MIN_FOCAL_PX)
             focals_px[camera.width, camera.height].append(focal_px)
     return {size: max(of_size) / min(of_size) for size, of_size in focals_px.items()}

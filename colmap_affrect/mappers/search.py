@@ -181,7 +181,9 @@ class Search:
             Whether no pair contradicts it and its focal lengths agree, or tracks of three images
             confirm each image.
         """
-        if not graph.largest_component.issubset(model.reg_image_ids()):
+        inside = set(model.reg_image_ids())
+        has_all = inside.issuperset(graph.keypoints)
+        if not has_all and not inside.issuperset(graph.largest_component):
             return False
         return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(
             model

@@ -1,53 +1,36 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
 import logging
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import with_shared_cameras
-from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior, camera_priors
 from colmap_affrect.mappers.distortion import cameras_that_tell_distortion
 from colmap_affrect.mappers.final_points import complete_points, extract_colors
-from colmap_affrect.mappers.groups import with_other_groups, with_places_mapped_again
-from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
-from colmap_affrect.mappers.other_motions import share_of_motion
-from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of, has_rigs
-from colmap_affrect.mappers.point_joining import joined_by_points
-from colmap_affrect.mappers.principal_points import (
-    axis_turns_deg,
-    freed_principal_point_cost,
-    gains_of_freedom,
-    with_free_principal_points,
-    with_shifted_axes,
+from colmap_affrect.mappers.groups import with_places_mapped_again
+from colmap_affrect.mappers.hypotheses import (
+    HypothesisTest,
+    joined_by_hand,
+    restarted,
 )
-from colmap_affrect.mappers.search import Search, with_new_images
+from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
+from colmap_affrect.mappers.model_score import ModelScorer
+from colmap_affrect.mappers.pair_graph import PairGraph, graph_of, has_rigs
+from colmap_affrect.mappers.rigs import certain_models_of_rigs
+from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.some_tracks import (
     large_models,
-    model_of_some_tracks,
 )
-from colmap_affrect.mappers.tie_joining import TieJoiner
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
-# What made a model, in the words of a report.
-# Others also verify sides that look the same
-MEASURED_PAIRS = "with the pairs of measured frames"
-ALL_PAIRS = "with all pairs"
-AGAIN = "after pairs were matched again"
-PER_IMAGE_CAMERAS = "with a camera for each photograph"
-COLMAP_MODEL = "from COLMAP's model"
-SHIFTED_AXES = "with optical axes off the middle"
-
-# Of COLMAP's models, the largest ones, that are gone on from; resource
-NUM_COLMAP_MODELS = 2
 # Option of pycolmap that users may give
 FORWARD_MOTION = "mapper.init_max_forward_motion"
 # Images from which on COLMAP's own pipeline maps: the search would take too long; resource
@@ -120,7 +103,7 @@ class SparseMapper(IncrementalMapper):
         search = self._search(task, graph, native, show_or_stop)
         search = replace(search, num_bridged_models=1)
         if task.previous_models:
-            found = _restarted(search, task.previous_models)
+            found = restarted(search, task.previous_models)
         else:
             by_colmap = partial(
                 super().map,
@@ -136,7 +119,7 @@ class SparseMapper(IncrementalMapper):
                     return found
                 return self._with_last_points(found, task, graph, native)
             found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
-        best = _joined_by_tie_points(search, search.with_bridges(graph, found))
+        best = joined_by_hand(search, search.with_bridges(graph, found))
         if not task.extend:
             return self._with_last_points(best, task, graph, native)
         for mapped in best:
@@ -166,7 +149,11 @@ class SparseMapper(IncrementalMapper):
             return self._tested(task, some, native, show, by_colmap=list)
 
         by_colmap = list if task.without_pairs else whole_by_colmap
-        best = self._tested(task, graph, native, show, by_colmap)
+        best = list[MappedModel]()
+        if graph.has_rigs:
+            search = self._search(task, graph, native, show)
+            best = certain_models_of_rigs(search, bare, self.options, output_path)
+        best = best or self._tested(task, graph, native, show, by_colmap)
         if not (task.tie_points or task.previous_models or graph.has_rigs):
             best = with_places_mapped_again(best, graph, map_some)
         for mapped in best:
@@ -197,8 +184,8 @@ class SparseMapper(IncrementalMapper):
         if len(cameras) < len(task.cameras):
             sharing = replace(task, cameras=cameras)
             shared = self._search(sharing, graph.with_cameras(cameras), native, show)
-            best = _HypothesisTest(task, shared, per_image, by_colmap).run()
-        return best or _HypothesisTest(task, per_image, None, by_colmap).run()
+            best = HypothesisTest(task, shared, per_image, by_colmap).run()
+        return best or HypothesisTest(task, per_image, None, by_colmap).run()
 
     def _with_last_points(
         self,
@@ -290,249 +277,3 @@ class SparseMapper(IncrementalMapper):
         if task.extend:
             constant |= native.constant_cameras
         return frozenset(constant)
-
-
-@dataclass(frozen=True)
-class _Hypothesis:
-    """Which pairs a model is made from."""
-
-    name: str  # in the words of a report
-    left_out: Collection[Ids]
-
-
-class _HypothesisTest:
-    """Makes models under several hypotheses and keeps those with the highest score."""
-
-    def __init__(
-        self,
-        task: MappingTask,
-        search: Search,
-        per_image: Search | None,
-        by_colmap: Callable[[], list[MappedModel]],
-    ) -> None:
-        """Begin with the previous models of a task.
-
-        Args:
-            task: What to map.
-            search: Makes and scores models, with the cameras that images have at first.
-            per_image: The same with a camera for each image; None if they have these at first.
-            by_colmap: Returns the models that COLMAP's own mapper makes.
-        """
-        self.task = task
-        self.by_colmap = by_colmap
-        self.search = search
-        self.per_image = per_image
-        self._begin_with_cameras_of(task.previous_models)
-        self.best = _restarted(self.search, task.previous_models)
-        self.score = self.search.best_score(self.best)
-
-    def run(self) -> list[MappedModel]:
-        """Return the best models."""
-        for hypothesis in self._hypotheses():
-            if self._is_certain():
-                break
-            models = self._built(hypothesis)
-            score = self.search.best_score(models)
-            if models and (not self.best or score > self.score):
-                self._take(models, score)
-                self._try_per_image_cameras(hypothesis)
-        if not self._is_certain():
-            self._try_colmap()
-        self._try_straight_lens()
-        self._try_shifted_axes()
-        self.best = with_other_groups(self.search, self.best)
-        self.best = joined_by_points(self.search, self.best)
-        return _joined_by_tie_points(self.search, self.best)
-
-    def _hypotheses(self) -> list[_Hypothesis]:
-        """Return the hypotheses, the one with the fewest pairs first."""
-        ids = {name: image_id for image_id, name in self.search.graph.names.items()}
-        unmeasured = set[Ids]()
-        for first, second in self.task.unmeasured_pairs:
-            unmeasured.add((min(ids[first], ids[second]), max(ids[first], ids[second])))
-        found = [_Hypothesis(ALL_PAIRS, ())]
-        if unmeasured:
-            found.insert(0, _Hypothesis(MEASURED_PAIRS, unmeasured))
-        return found
-
-    def _is_certain(self) -> bool:
-        if not self.best:
-            return False
-        return self.search.is_certain(self.best[0].reconstruction, self.search.graph)
-
-    def _built(self, hypothesis: _Hypothesis) -> list[MappedModel]:
-        """Return the models of a hypothesis, none where it explains no more than the best ones.
-
-        Models that were known before are adjusted with its pairs, too, so that all of them have
-        its name, each after the hypotheses that made it before.
-        """
-        graph = self.search.graph.without(hypothesis.left_out)
-        if not self.best:
-            models = model_of_some_tracks(self.search, graph)
-            models = models or self.search.best(graph)
-            return [mapped.first_by(hypothesis.name) for mapped in models]
-        if not graph.unexplained_by(self.best[0].reconstruction):
-            return []
-        models = self.search.extend_models(graph, self.best)
-        return [mapped.also_by(hypothesis.name) for mapped in models]
-
-    def _take(self, models: Sequence[MappedModel], score: float) -> None:
-        self.best = list(models)
-        self.score = score
-
-    def _try_colmap(self) -> None:
-        """Take over the poses of COLMAP's own model where the model of these scores higher.
-
-        COLMAP refines an unknown focal length from its one default on as a model grows, and may
-        end elsewhere than the values that the search begins with. Where all are known, it begins
-        at the same values as the search, and a second mapping would cost time for nothing else.
-        """
-        search = self.search
-        if not search.unknown or search.graph.has_rigs or self.task.previous_models:
-            return
-        try:
-            models = self.by_colmap()
-        except AffrectError as error:  # ours stays
-            logger.info("%s", error)
-            return
-        models.sort(key=lambda mapped: -mapped.reconstruction.num_reg_images())
-        grower = search.grower(search.graph)
-        found = list[MappedModel]()
-        for mapped in models[:NUM_COLMAP_MODELS]:
-            found.append(MappedModel(grower.remake(mapped.reconstruction)))
-        found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
-        found = search.with_bridges(search.graph, found)
-        score = search.best_score(found)
-        if found and score > self.score + MIN_SCORE_GAIN:
-            self._take([mapped.first_by(COLMAP_MODEL) for mapped in found], score)
-
-    def _begin_with_cameras_of(self, models: Sequence[MappedModel]) -> None:
-        """Go on with the cameras, and the optical axes, that models had."""
-        told = set[str]()
-        for mapped in models:
-            told.update(mapped.hypotheses)
-        if self.per_image and not told.isdisjoint({PER_IMAGE_CAMERAS, SHIFTED_AXES}):
-            self.search = self.per_image
-            self.per_image = None
-        if SHIFTED_AXES in told:
-            free = with_free_principal_points(self.search, self.task.cameras)
-            self.search = free or self.search
-
-    def _try_straight_lens(self) -> None:
-        """Adjust the best model from a straight lens where that leads to a better optimum."""
-        if not self.best or not self.search.unknown:
-            return
-        model = self.search.from_straight_lens(self.best[0].reconstruction)
-        self.best = [replace(self.best[0], reconstruction=model), *self.best[1:]]
-        self.score = self.search.best_score(self.best)
-
-    def _try_shifted_axes(self) -> None:
-        """Free the principal points of the best model where its points ask for it.
-
-        Where the points leave that open, how far rotations turn with free ones says how sure they
-        are.
-        """
-        search = self.search
-        if not self.best or search.graph.has_rigs:
-            return
-        free = with_free_principal_points(search, self.task.cameras)
-        model = self.best[0].reconstruction
-        if free is None:
-            return
-        gains = gains_of_freedom(model, search, free)
-        if gains.contradict_constant and self._take_shifted_axes(free):
-            return
-        if gains.leave_constant_open:
-            turns_deg = axis_turns_deg(model, free, search.graph)
-            self.best = [
-                replace(self.best[0], axis_turns_deg=turns_deg),
-                *self.best[1:],
-            ]
-
-    def _take_shifted_axes(self, free: Search) -> bool:
-        """Take the best model with free principal points where it scores higher; tell whether."""
-        search = self.search
-        model = self.best[0].reconstruction
-        changed = with_shifted_axes(model, free, search.graph)
-        share = self._motion_share(self.best[0])
-        first = replace(self.best[0], reconstruction=changed, motion_share=share)
-        found = free.with_bridges(search.graph, [first.also_by(SHIFTED_AXES)])
-        found = with_new_images([*found, *self.best[1:]])
-        score = free.best_score(found[:1])
-        # That the points ask for it has paid for the principal points.
-        paid = freed_principal_point_cost(found[0].reconstruction, search, free)
-        if score + paid > self.score + MIN_SCORE_GAIN:
-            self.search = free
-            self._take(found, score)
-            return True
-        return False
-
-    def _try_per_image_cameras(self, hypothesis: _Hypothesis) -> None:
-        """Give each image of the best model a camera of its own where that scores higher."""
-        if self.per_image is None:
-            return
-        first = self.best[0]
-        graph = self.per_image.graph.without(hypothesis.left_out)
-        model = _with_per_image_cameras(
-            self.per_image, graph, self.search, first.reconstruction
-        )
-        if model is None:
-            return
-        score = self.per_image.scorer.score(model)
-        if score <= self.score + MIN_SCORE_GAIN:
-            return
-        share = self._motion_share(first)
-        changed = replace(first, reconstruction=model, motion_share=share)
-        # The others, too: what is shared and what is not do not fit into one graph.
-        others = [_remade(self.per_image, mapped) for mapped in self.best[1:]]
-        self.best = with_new_images([changed.also_by(PER_IMAGE_CAMERAS), *others])
-        self.search = self.per_image
-        self.per_image = None
-        self.score = self.search.best_score(self.best)
-
-    def _motion_share(self, mapped: MappedModel) -> float:
-        """Return the share of what moves as a model says: other cameras may hide the rest."""
-        found = share_of_motion(mapped.reconstruction, self.search.graph)
-        return min(found, mapped.motion_share)
-
-
-def _joined_by_tie_points(
-    search: Search, models: Sequence[MappedModel]
-) -> list[MappedModel]:
-    grower = search.grower(search.graph)
-    return TieJoiner(search.adjuster.tie_points, grower, search.scorer).join(models)
-
-
-def _restarted(search: Search, previous: Sequence[MappedModel]) -> list[MappedModel]:
-    """Return models with the poses of previous ones, and all that their tracks now register."""
-    return with_new_images(_remade(search, one).also_by(AGAIN) for one in previous)
-
-
-def _remade(search: Search, mapped: MappedModel) -> MappedModel:
-    """Return a model with its poses, adjusted with the cameras and pairs of a search."""
-    model = search.grower(search.graph).remake(mapped.reconstruction)
-    return replace(mapped, reconstruction=model)
-
-
-def _with_per_image_cameras(
-    per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
-) -> pycolmap.Reconstruction | None:
-    """Return a model with a camera for each image.
-
-    Args:
-        per_image: Makes the model.
-        graph: Its pairs.
-        shared: Scores the model with shared cameras.
-        model: The model with shared cameras.
-
-    Returns:
-        The model; None where it scores no higher with some of the tracks.
-    """
-    thin = graph.thinned()
-    if thin is not graph:
-        trial = per_image.comparing().grower(thin).restart_from(model)
-        per_image_score = replace(per_image.scorer, graph=thin).score(trial)
-        shared_score = replace(shared.scorer, graph=thin).score(model)
-        if per_image_score <= shared_score + MIN_SCORE_GAIN:
-            return None
-    return per_image.grower(graph).remake(model)

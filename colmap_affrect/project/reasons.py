@@ -22,6 +22,8 @@ DoubtCode = Literal[
     "bridge_edge",
     "near_others",
     "axis_unclear",
+    "camera_shared",
+    "cameras_differ",
     "principal_point_contradicted",
     "other_surroundings",
     "two_places",
@@ -55,6 +57,14 @@ SENTENCES: dict[DoubtCode, str] = {
     "axis_unclear": (
         "points say that optical axes are off the middle of photographs, but not where: its "
         "rotation may be off by {turn_deg:.0f} degrees"
+    ),
+    "camera_shared": (
+        "photographs of its size are taken for those of one camera: with cameras of their own, "
+        "which fit as well, it stands elsewhere, by {turn_deg:.0f} degrees"
+    ),
+    "cameras_differ": (
+        "photographs of its size are taken for those of different cameras: with one camera, which "
+        "fits nearly as well, it stands elsewhere, by {turn_deg:.0f} degrees"
     ),
     "principal_point_contradicted": (
         "the given principal point does not fit, and its rotation may be off by {turn_deg:.0f} "

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 from colmap_affrect.errors import shown
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -69,6 +67,8 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
 
     def finalized(value: Any) -> Any:
         return shown(without_folders(value, folders)) if type(value) is str else value
+
+    import jinja2  # a run without a page needs none of it
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(

@@ -156,6 +156,7 @@ def stage_functions() -> list[tuple[Any, str, str]]:
     from colmap_affrect.escalation.escalate import Escalation
 
     return [
+        # of the pipeline and of what maps and matches again
         (pipeline, "extract_features", "extract"),
         (pipeline, "list_pairs", "pairs"),
         (pipeline, "match_pairs", "match"),
@@ -287,7 +288,12 @@ def rows_of(found: Sequence[dict[str, Any]], kind: str) -> list[list[str]]:
 def main() -> None:
     """Print the tables."""
     parser = parser_of(__doc__)
-    parser.add_argument("--output-path", type=Path, required=True)
+    parser.add_argument(
+        "--output-path",
+        type=Path,
+        required=True,
+        help="folder of photographs, results and costs.json",
+    )
     parser.add_argument(
         "--num-images",
         type=int,

@@ -477,6 +477,42 @@ def left_out(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
     return found
 
 
+def fitted_constant(
+    log_odds: NDArray[np.float64],
+    right: NDArray[np.float64],
+    factors: NDArray[np.float64],
+) -> float:
+    """Fit what is added to log odds, by maximum likelihood, to a hundredth.
+
+    Args:
+        log_odds: Of each photograph, by weights that stay, (N,).
+        right: Whether it is right, 1 or 0, (N,).
+        factors: Of its probability, by what is not fitted, (N,).
+    """
+    constants = np.linspace(-3.0, 3.0, 601)
+    fractions = 1.0 / (1.0 + np.exp(-log_odds[:, None] - constants))
+    chances = np.clip(factors[:, None] * fractions, MIN_CHANCE, 1.0 - MIN_CHANCE)
+    is_right = right[:, None] > 0.0
+    likelihoods = np.log(np.where(is_right, chances, 1.0 - chances)).sum(axis=0)
+    return float(constants[likelihoods.argmax()])
+
+
+def constant_left_out(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
+    """Return the probability of each row by a constant that is fitted to all other scenes."""
+    right = np.array([float(row["right"]) for row in rows])
+    factors = np.array([row["factor"] for row in rows])
+    fractions = as_committed(rows) / factors
+    log_odds = np.log(fractions / (1.0 - fractions))
+    scenes = np.array([row["scene"] for row in rows])
+    found = np.zeros(len(rows))
+    for scene in sorted(set(scenes)):
+        out = scenes == scene
+        constant = fitted_constant(log_odds[~out], right[~out], factors[~out])
+        found[out] = factors[out] / (1.0 + np.exp(-log_odds[out] - constant))
+        print(f"without {scene}: {constant:+.2f}")
+    return found
+
+
 def as_committed(rows: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
     """Return the probability of each row by the coefficients that the package has."""
     content = json.loads(COEFFICIENTS.read_text(encoding="utf-8"))
@@ -576,16 +612,21 @@ def main() -> None:
     parser.add_argument(
         "--keep", action="store_true", help="the coefficients that the package has"
     )
+    parser.add_argument(
+        "--constant",
+        action="store_true",
+        help="show what the constant alone would be; no coefficients are written",
+    )
     options = parser.parse_args()
     rows = rows_of_sets(options)
     right = np.array([float(row["right"]) for row in rows])
     before = scores(as_committed(rows), right)
-    probabilities = left_out(rows)
+    probabilities = constant_left_out(rows) if options.constant else left_out(rows)
     for key, score in scores(probabilities, right).items():
         print(f"| {key} | {before[key]:.4g} | {score:.4g} |")
     for title, number, mean, share in draw(probabilities, right, options.diagram_path):
         print(f"| {title} | {number} | {mean:.3f} | {share:.3f} |")
-    if not options.keep:
+    if not (options.keep or options.constant):
         write_coefficients(rows, len(options.sets))
 
 

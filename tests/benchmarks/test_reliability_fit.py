@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reliability import fitted
+from reliability import fitted, fitted_constant
 
 WEIGHTS = np.array([2.0, 0.7])
 CONSTANT = -0.5
@@ -33,3 +33,12 @@ def test_terms_that_speak_against_right_photographs_count_nothing() -> None:
     slopes, _ = fitted(values, right, np.ones(2_000))
     assert slopes[0] > 1.0
     assert slopes[1] == 0.0
+
+
+def test_a_constant_comes_out_as_it_went_in() -> None:
+    rng = np.random.default_rng(2)
+    log_odds = rng.normal(0.0, 2.0, 20_000)
+    factors = rng.uniform(0.5, 1.0, 20_000)
+    chances = factors / (1.0 + np.exp(-log_odds - 0.6))
+    right = (rng.uniform(size=20_000) < chances).astype(float)
+    assert fitted_constant(log_odds, right, factors) == pytest.approx(0.6, abs=0.1)

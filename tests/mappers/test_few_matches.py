@@ -226,3 +226,28 @@ def test_tie_points_alone_begin_a_model(tmp_path: Path) -> None:
     assert len(model.registered_names) == 5
     assert len(model.tie_points) == 5 * 8
     assert largest_error_deg(tmp_path / "sparse" / "0", truth) < 2.0
+
+
+def test_frames_of_rigs_that_other_images_tie_need_no_few_matches(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(
+        path,
+        num_rigs=1,
+        num_cameras_per_rig=2,
+        num_frames_per_rig=3,
+        num_points3D=NUM_TARGETS,
+    )
+    without_geometries(path)
+    with open_database(path) as database:
+        frame_of = {i.image_id: i.frame_id for i in database.read_all_images()}
+        all_sure = sure_few_matches(database, {})
+        tie = all_sure[0]
+        others = sure_few_matches(database, {tie.ids: tie.matches})
+    tied = {frame_of[image_id] for image_id in tie.ids}
+    frames = [{frame_of[image_id] for image_id in one.ids} for one in others]
+    assert len(tied) == 2
+    assert len(all_sure) == 3 * 4  # of each two frames two images by two
+    assert len(others) == 2 * 4
+    assert tied not in frames

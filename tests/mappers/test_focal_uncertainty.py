@@ -18,9 +18,10 @@ from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import USUAL_SIGMA, CameraPrior
 from colmap_affrect.mappers.focal_observability import (
     MIN_GROWTH,
+    FreedFocals,
     _growths,
-    fitting_focals,
     focal_growths,
+    freed_focals,
 )
 from colmap_affrect.mappers.focal_uncertainty import focal_sigmas
 
@@ -119,11 +120,8 @@ def test_where_there_is_no_covariance_other_focal_lengths_are_tried(
         assert 0.2 < by_covariance[key] / growth < 5.0
 
 
-@pytest.mark.parametrize(("factor", "expected"), [(1.0, {}), (0.8, IDS), (1.3, IDS)])
-def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
-    factor: float, expected: tuple[int, ...]
-) -> None:
-    """Each alone may be right by the points: that all change together is one parameter."""
+def freed_by(factor: float) -> FreedFocals:
+    """Free focal lengths that were given so many times too long."""
     model = model_of(FAR, 0.7, turns_deg=(0.0, 3.0, -2.0, 1.0))
     records = {}
     for key in IDS:
@@ -135,10 +133,30 @@ def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
     Adjuster(priors, NOISE_PX, refining).adjust(model, FINAL)
     task = MappingTask(Path("none.db"), None, cameras=records)
-    found = fitting_focals(model, task, priors)
-    assert found.keys() == set(expected)
-    for focal_px in found.values():
-        assert focal_px == pytest.approx(FOCAL_PX, rel=0.05)
+    return freed_focals(model, task, priors)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.3])
+def test_given_focal_lengths_that_are_wrong_by_one_factor_are_told_as_one(
+    factor: float,
+) -> None:
+    """Each alone may be right by the points: that all change together is one parameter."""
+    found = freed_by(factor)
+    expected = dict.fromkeys(IDS, FOCAL_PX)
+    assert found.fitting_px == pytest.approx(expected, rel=0.05)
+    assert found.other.log_odds > 0.5
+    assert min(found.other.turns_deg.values()) > 0.3
+
+
+def test_given_focal_lengths_that_are_right_are_as_likely_as_before_and_turn_nothing() -> (
+    None
+):
+    found = freed_by(1.0)
+    assert not found.fitting_px
+    assert found.other.log_odds == pytest.approx(np.log(1.0 / 9.0), abs=0.3)
+    turns_deg = found.other.turns_deg
+    assert turns_deg == pytest.approx(dict.fromkeys(turns_deg, 0.0), abs=0.3)
+    assert len(turns_deg) == len(IDS)
 
 
 class FakeTrials:

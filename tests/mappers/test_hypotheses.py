@@ -13,9 +13,9 @@ from mapping_tasks import mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.hypotheses import ALL_PAIRS, MEASURED_PAIRS
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.sparse import ALL_PAIRS, MEASURED_PAIRS
 
 
 def test_a_model_that_grew_anew_does_not_name_the_hypothesis_it_was_not_made_by(

@@ -23,6 +23,7 @@ from colmap_affrect.mappers.camera_priors import (
     is_off_center,
     shifted_principal_point,
 )
+from colmap_affrect.mappers.hypotheses import SHIFTED_AXES
 from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.principal_points import (
@@ -32,7 +33,6 @@ from colmap_affrect.mappers.principal_points import (
     with_free_principal_points,
 )
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.sparse import SHIFTED_AXES
 
 pytestmark = pytest.mark.long
 

@@ -20,10 +20,11 @@ from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import CameraPrior
+from colmap_affrect.mappers.other_cameras import OtherPose
 from colmap_affrect.mappers.pair_graph import VerifiedPair
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
-from colmap_affrect.project.reasons import Doubt
+from colmap_affrect.project.reasons import SENTENCES, Doubt, DoubtCode
 from colmap_affrect.project.report import DOUBTFUL, SURE
 
 
@@ -104,10 +105,6 @@ def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> N
         "focal observability": (
             replace(good, focal_growth=0.001),
             "any focal length fits",
-        ),
-        "given focal length": (
-            replace(good, focal_px=720.4, fitting_focal_px=910.2),
-            "the given focal length does not fit, 720 px: 910 px does",
         ),
         "parallax": (
             replace(good, pure_rotation_ratio=1.0),
@@ -221,6 +218,36 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     assert far_off.of_evidence == pytest.approx(confidence(GOOD).probability)
 
 
+NAMED = "the given focal length does not fit, 1000 px: 910 px does"
+
+
+@pytest.mark.parametrize(
+    ("pose", "share"),
+    [
+        (OtherPose(0.5, 1.0), 1.0),  # with other cameras it stands where it does
+        (OtherPose(0.5, 6.0), 0.75),
+        (OtherPose(0.5, 60.0), 0.5),
+        (OtherPose(0.01, 60.0), 0.99),
+        (OtherPose(1.0, 60.0), 0.007),
+    ],
+)
+def test_other_cameras_take_as_much_as_they_are_likely_and_turn_a_pose(
+    pose: OtherPose, share: float
+) -> None:
+    before = confidence(GOOD).probability
+    shared = confidence(replace(GOOD, with_other_cameras=pose))
+    given = confidence(replace(GOOD, with_free_focals=pose))
+    assert shared.probability / before == pytest.approx(share, abs=0.01)
+    assert given.probability == pytest.approx(shared.probability)
+    differ = confidence(replace(GOOD, with_other_cameras=replace(pose, is_shared=True)))
+    assert differ.probability == pytest.approx(shared.probability)
+    named = confidence(replace(GOOD, with_free_focals=pose, fitting_focal_px=910.2))
+    first = {one.reasons[0].text() for one in (shared, differ, given, named)}
+    codes: tuple[DoubtCode, ...] = ("camera_shared", "cameras_differ", "focal_unknown")
+    said = {SENTENCES[code].format(turn_deg=60.0) for code in codes} | {NAMED}
+    assert (first == said) == (share <= 0.5)
+
+
 def test_a_cut_pair_casts_doubt_on_the_smaller_of_two_components(
     tmp_path: Path,
 ) -> None:
@@ -284,10 +311,15 @@ def test_only_focal_lengths_that_the_model_tells_are_compared(tmp_path: Path) ->
     mapped, task = scene(tmp_path)
     camera = last(mapped).camera
     camera.params[list(camera.focal_length_idxs())] *= 1.5
-    for growth, zoom in ((0.2, 1.5), (0.01, 1.0)):
-        growths = dict.fromkeys(mapped.reconstruction.cameras, growth)
-        found = features_of(mapped, task, growths)
+    growths = dict.fromkeys(mapped.reconstruction.cameras, 0.2)
+    hardly_told = dict.fromkeys(mapped.reconstruction.cameras, 0.01)
+    for growths_of_all, zoom in ((growths, 1.5), (hardly_told, 1.0)):
+        found = features_of(mapped, task, growths_of_all)
         assert [one.focal_spread for one in found.values()] == pytest.approx([zoom] * 5)
+    # Where it was found that its middle is elsewhere, nothing is wrong with a part.
+    camera.params[list(camera.principal_point_idxs())] += 60.0
+    found = features_of(mapped, task, growths)
+    assert [one.focal_spread for one in found.values()] == pytest.approx([1.0] * 5)
 
 
 def add_mirrored_copy(

@@ -15,7 +15,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_tracks
-from colmap_affrect.mappers import focal_observability, reliability_features
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.mappers import focal_observability, reliability_features, rigs
 from colmap_affrect.mappers.adjustment import EarlyStop
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import (
@@ -23,9 +24,12 @@ from colmap_affrect.mappers.focal_observability import (
     focal_growths,
     with_fewer_points,
 )
+from colmap_affrect.mappers.hypotheses import ALL_PAIRS
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.rigs import COLMAP_MODEL
 from colmap_affrect.mappers.search import first_pairs
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 
 SIZE = (1024, 768)
 
@@ -67,11 +71,60 @@ def test_pairs_of_a_rig_with_itself_tell_no_rotation(
     assert len(found) == 12
     assert {features.pure_rotation_ratio for features in found.values()} == {0.25}
     num_frames = 4
-    assert (
-        num_frames
-        <= len(measured)
-        <= reliability_features.NUM_ROTATION_PAIRS * num_frames
+    assert num_frames <= len(measured) <= 2 * num_frames
+
+
+def test_rig_is_no_mirrored_copy_and_photographs_may_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared = list[Any]()
+
+    def share(*given: Any) -> float:
+        compared.append(given)
+        return 0.0
+
+    monkeypatch.setattr(reliability_features, "mirrored_share", share)
+    for name, num_cameras in (("rig", 3), ("photographs", 1)):
+        path = tmp_path / f"{name}.db"
+        model = synthesize_rig(path, num_cameras_per_rig=num_cameras)
+        task = MappingTask(path, None)
+        reliability_features.features_of(MappedModel(model), task)
+        assert bool(compared) == (name == "photographs")
+
+
+def test_rigs_are_models_of_colmap_where_these_are_certain(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize_rig(path)
+    task = MappingTask(path, None, cameras=unknown_cameras(path))
+    (model,) = map_database(
+        mapper_of("sparse"), task, tmp_path / "sparse", lambda _: None
     )
+    assert model.hypotheses == (COLMAP_MODEL,)
+    assert len(model.registered_names) == 12
+
+
+@pytest.mark.parametrize("why", ["none", "two", "error", "not certain"])
+def test_rigs_are_searched_for_where_colmap_is_not_certain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    path = tmp_path / "database.db"
+    true = synthesize_rig(path)
+
+    def by_colmap(*_: Any) -> list[MappedModel]:
+        if why == "error":
+            raise AffrectError("COLMAP ended")
+        model = true
+        if why == "not certain":
+            model = pycolmap.Reconstruction(true)
+            model.deregister_frame(max(model.reg_frame_ids()))
+        number = {"none": 0, "two": 2}.get(why, 1)
+        return number * [MappedModel(model)]
+
+    monkeypatch.setattr(rigs.IncrementalMapper, "map", by_colmap)
+    task = MappingTask(path, None, cameras=unknown_cameras(path))
+    found = SparseMapper(SparseOptions()).map(task, tmp_path, 0, lambda _: None)
+    assert [mapped.hypotheses[0] for mapped in found] == [ALL_PAIRS]
+    assert found[0].reconstruction.num_reg_images() == 12
 
 
 def test_models_with_enough_long_tracks_are_told_from_others(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from colmap_affrect.mappers.camera_priors import (
     camera_priors,
 )
 from colmap_affrect.mappers.growing import Grower
+from colmap_affrect.mappers.hypotheses import COLMAP_MODEL, PER_IMAGE_CAMERAS
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.model_score import (
     MIN_SCORE_GAIN,
@@ -43,7 +44,6 @@ from colmap_affrect.mappers.model_score import (
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of
 from colmap_affrect.mappers.search import Search, _Attempt, _grow_in_order, first_pairs
-from colmap_affrect.mappers.sparse import COLMAP_MODEL, PER_IMAGE_CAMERAS
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
