@@ -104,6 +104,21 @@ class LineCamera:
 
 
 @dataclass(frozen=True)
+class LineFindings:
+    """What the straight lines of a photograph say in the end.
+
+    Attributes:
+        num_segments: straight segments that were looked at.
+        camera: by the lines; None where they are too few.
+        says_shifted: whether they say that the optical axis is not in the middle of the image.
+    """
+
+    num_segments: int
+    camera: LineCamera | None
+    says_shifted: bool
+
+
+@dataclass(frozen=True)
 class Explanation:
     """The likeliest camera on the grid, and which segments it explains.
 
@@ -169,6 +184,10 @@ class Lines:
             return None
         sigma = self.usual_shift_sigma if shift_sigma is None else shift_sigma
         return line_camera(self.likelihood, sigma)
+
+    def findings(self) -> LineFindings:
+        """Return what the lines say in the end."""
+        return LineFindings(len(self.segments), self.camera(), self.says_shifted)
 
     def explanation(self) -> Explanation | None:
         """Return which segments belong to which direction; None where they are too few."""

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TextIO, overload
 
@@ -19,6 +20,7 @@ from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.paths import resolved
+from colmap_affrect.project.record import stamp_of
 from colmap_affrect.project.regular_files import open_regular
 
 Pair = tuple[str, str]  # names of two photographs, in order
@@ -242,6 +244,32 @@ def read_pairs(
     return PairList(ordered, numbers)
 
 
+def read_pairs_once(
+    path: Path, names: Sequence[str], image_path: Path | None = None
+) -> PairList:
+    """Return a pair list, read once while its size and times stay as they are.
+
+    Args:
+        path: the list.
+        names: as for :func:`read_pairs`.
+        image_path: as for :func:`read_pairs`.
+
+    Returns:
+        The pairs, sorted.
+
+    Raises:
+        AffrectError: as :func:`read_pairs` does.
+    """
+    return _read_once(path, stamp_of([path]), tuple(names), image_path)
+
+
+@lru_cache(maxsize=4)
+def _read_once(
+    path: Path, _: str, names: tuple[str, ...], image_path: Path | None
+) -> PairList:
+    return read_pairs(path, names, image_path)
+
+
 def _read_codes(path: Path, names: Sequence[str], folders: Sequence[str]) -> Indices:
     """Return each pair of a list as one number, as :func:`_codes` says, (N,).
 
@@ -302,7 +330,9 @@ def _codes(
     """
     number = {name: index for index, name in enumerate(names)}
     for line_number, line in _without_comments(lines, [*names, *folders]):
-        pair = split_line(line.rstrip("\n"), number) or split_line(line.strip(), number)
+        pair = _two_words(line, number)
+        pair = pair or split_line(line.rstrip("\n"), number)
+        pair = pair or split_line(line.strip(), number)
         pair = pair or split_of_others(line, number, folders)
         if pair:
             low, high = sorted((number[pair[0]], number[pair[1]]))
@@ -338,6 +368,17 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     has_blanks = any(re.search(r"\s", name) for name in names)
     separator = "\t" if has_blanks else " "
     replace_text(path, (f"{first}{separator}{second}\n" for first, second in pairs))
+    _read_once.cache_clear()  # it may have changed within one tick of the clock
+
+
+def _two_words(line: str, known: Collection[str]) -> Pair | None:
+    """Return the names of a line as most are, which can be split in one way only."""
+    words = line.split()
+    if len(words) != 2 or "," in line:
+        return None
+    first, second = words
+    is_bare = line == f"{first} {second}\n"
+    return (first, second) if is_bare and first in known and second in known else None
 
 
 def split_line(line: str, known: Collection[str]) -> Pair | None:

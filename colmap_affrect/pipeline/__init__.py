@@ -28,7 +28,7 @@ from colmap_affrect.mappers.existing import (
 from colmap_affrect.mend import mend_and_seal
 from colmap_affrect.options import takes_fields_of
 from colmap_affrect.pairs.given_matches import MatchType
-from colmap_affrect.pairs.lists import PairOptions, read_pairs
+from colmap_affrect.pairs.lists import PairOptions, read_pairs_once
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import GivenProgress, Progress
 from colmap_affrect.project.argument_types import require_bools
@@ -120,7 +120,8 @@ def _run(
         options.extend, mapper, output_path=workspace.path, overwrite=overwrite
     )
     names = _checked_names(inputs, options, mapper)
-    num_pairs = _num_pairs(names, options=options.pairs, image_path=image_path)
+    folder = Path(inputs.image_path)
+    num_pairs = _num_pairs(names, options=options.pairs, image_path=folder)
     usable = options.resources.usable_levels(recipe.extraction)
     megapixels = _megapixels(names, image_path, recipe.extraction.max_image_size_px)
     is_new = overwrite or not workspace.features.exists()
@@ -211,7 +212,7 @@ def _check_extension(
 def _num_pairs(names: Sequence[str], options: PairOptions, image_path: Path) -> int:
     """Return about how many pairs there will be."""
     if options.match_list_path:
-        return len(read_pairs(Path(options.match_list_path), names, image_path))
+        return len(read_pairs_once(Path(options.match_list_path), names, image_path))
     count = math.comb(len(names), 2)
     is_all = "exhaustive" in options.methods
     return count if is_all else min(count, len(names) * options.num_neighbors)

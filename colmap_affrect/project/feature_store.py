@@ -21,7 +21,13 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Floats, Indices, Singles
 from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.lines import Lines
+from colmap_affrect.geometry.lines import LineFindings, Lines
+from colmap_affrect.project.feature_summary import (
+    ImageSummary,
+    read_summaries,
+    summary_path,
+    write_summaries,
+)
 from colmap_affrect.project.group_store import (
     GroupStore,
     entries_of,
@@ -38,19 +44,51 @@ from colmap_affrect.project.record import Content, stamp_of
 
 NOT_KNOWN = Content()
 
-Entries = dict[str, tuple[Content, int, tuple[int, int]]]
-"""By image: what it was extracted from, the number of its features, and (width, height) in px."""
+
+@lru_cache(maxsize=8)
+def _kept_summaries(path: Path, stamp: str) -> dict[str, ImageSummary] | None:
+    """Return the summaries beside a file while they belong to it."""
+    return read_summaries(path, stamp)
 
 
 @lru_cache(maxsize=8)
-def _entries_of(path: Path, _: str) -> Entries:
-    """Go through a file, which takes long, unless that was done when its stamp was the same."""
-    found: Entries = {}
+def _entries_of(path: Path, stamp: str) -> Mapping[str, ImageSummary]:
+    """Return summaries, perhaps without lines.
+
+    A file is gone through, which takes long, unless that was done when its stamp was the same.
+    """
+    kept = _kept_summaries(path, stamp)
+    if kept is not None:
+        return kept
+    found = dict[str, ImageSummary]()
     with FeatureStore(path)._open("r") as file:
         for name, group in entries_of(file):
             width, height = read_checked(group, "image_size").tolist()
-            found[name] = _content(group), num_rows(group, "keypoints"), (width, height)
+            found[name] = ImageSummary(
+                content=_content(group),
+                num_features=num_rows(group, "keypoints"),
+                image_size=(width, height),
+                lines=None,
+            )
     return dict(sorted(found.items()))
+
+
+@lru_cache(maxsize=8)
+def _summaries_of(path: Path, stamp: str) -> Mapping[str, ImageSummary]:
+    """Return summaries with what lines say, in the same way."""
+    kept = _kept_summaries(path, stamp)
+    if kept is not None:
+        return kept
+    entries = _entries_of(path, stamp)
+    found = dict(entries)
+    for name, lines in FeatureStore(path).lines_of(entries).items():
+        found[name] = entries[name]._replace(lines=lines.findings())
+    return found
+
+
+def _forget_summaries() -> None:
+    for known in (_kept_summaries, _entries_of, _summaries_of):
+        known.cache_clear()
 
 
 def _content(group: h5py.Group) -> Content:
@@ -83,17 +121,28 @@ class FeatureStore(GroupStore):
     format = "colmap_affrect/features"
     stage = "extract"
 
-    def _entries(self) -> Entries:
-        return (
-            _entries_of(self.path, stamp_of([self.path])) if self.path.exists() else {}
-        )
+    def _entries(self) -> Mapping[str, ImageSummary]:
+        if not self.path.exists():
+            return {}
+        return _entries_of(self.path, stamp_of([self.path]))
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
         if mode != "r":
-            _entries_of.cache_clear()  # it may change again within one tick of the clock
+            # It may change again within one tick of the clock.
+            summary_path(self.path).unlink(missing_ok=True)
+            _forget_summaries()
         with super()._open(mode) as file:
             yield file
+
+    def keep_summaries(self) -> None:
+        """Write beside the file what later commands need of it, unless that is there."""
+        if not self.path.exists():
+            return
+        stamp = stamp_of([self.path])
+        if _kept_summaries(self.path, stamp) is None:
+            write_summaries(self.path, stamp, _summaries_of(self.path, stamp))
+            _kept_summaries.cache_clear()
 
     def names(self) -> list[str]:
         """Return the sorted names of the images."""
@@ -129,7 +178,7 @@ class FeatureStore(GroupStore):
 
     def contents(self) -> dict[str, Content]:
         """Return for each image what the files hold that it was extracted from."""
-        return {name: content for name, (content, *_) in self._entries().items()}
+        return {name: entry.content for name, entry in self._entries().items()}
 
     def record_contents(self, contents: Mapping[str, Content]) -> None:
         """Put on record what images were extracted from."""
@@ -211,6 +260,16 @@ class FeatureStore(GroupStore):
                         found[name] = lines
         return found
 
+    def line_findings(self) -> dict[str, LineFindings]:
+        """Return what the straight lines of images say, of all that have some on record."""
+        if not self.path.exists():
+            return {}
+        found = dict[str, LineFindings]()
+        for name, summary in _summaries_of(self.path, stamp_of([self.path])).items():
+            if summary.lines:
+                found[name] = summary.lines
+        return found
+
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, rising.
 
@@ -260,7 +319,7 @@ class FeatureStore(GroupStore):
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
-        return {name: count for name, (_, count, _) in self._entries().items()}
+        return {name: entry.num_features for name, entry in self._entries().items()}
 
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
@@ -269,7 +328,7 @@ class FeatureStore(GroupStore):
 
     def image_sizes(self) -> dict[str, tuple[int, int]]:
         """Return the (width, height) of each image in px."""
-        return {name: size for name, (*_, size) in self._entries().items()}
+        return {name: entry.image_size for name, entry in self._entries().items()}
 
     def read_frames(self, name: str) -> Singles:
         """Read the (N, 2, 3) frames of one image."""

@@ -11,6 +11,7 @@ from colmap_affrect.geometry.lines import (
     FOCALS,
     MIN_NUM_SEGMENTS,
     SHIFTS,
+    LineFindings,
     LineLikelihood,
     Lines,
 )
@@ -77,22 +78,22 @@ class LineReport:
         return text
 
 
-def line_report(lines: Lines, image_size: tuple[int, int]) -> LineReport:
+def line_report(found: LineFindings, image_size: tuple[int, int]) -> LineReport:
     """Return what lines say of the camera of a photograph of (width, height) px."""
-    camera = lines.camera()
+    camera = found.camera
     if camera is None:
-        return LineReport(len(lines.segments))
+        return LineReport(found.num_segments)
     longer_side = max(image_size)
     x, y, z = camera.up.tolist()
     return LineReport(
-        num_segments=len(lines.segments),
+        num_segments=found.num_segments,
         is_known=camera.is_known,
         focal_px=camera.focal * longer_side,
         focal_mm=camera.focal * FILM_MM,
         focal_sigma=camera.focal_sigma,
         shift_px=camera.shift * longer_side,
         shift_sigma_px=camera.shift_sigma * longer_side,
-        is_shifted=lines.says_shifted,
+        is_shifted=found.says_shifted,
         up=(x, y, z),
     )
 

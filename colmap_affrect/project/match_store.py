@@ -278,6 +278,16 @@ class MatchStore(GroupStore):
         if level < 0 or (self.num_levels is not None and level >= self.num_levels):
             raise ValueError(f"matches are of level {level}, which the recipe has not")
 
+    def levels_of_stored(self, pairs: Iterable[Names]) -> dict[Names, int]:
+        """Return the level that the matches of each pair are from, of those that are stored."""
+        levels = dict[Names, int]()
+        with self._open("r") as file:
+            for pair in pairs:
+                key = pair_key(*pair)
+                if has_entry(file, key):
+                    levels[pair] = int(file[key].attrs["level"])
+        return levels
+
     def read(self, pairs: Sequence[Names]) -> Iterator[PairMatches]:
         """Yield the matches of each pair; StoreError at a pair without matches."""
         with self._open("r") as file:

@@ -20,6 +20,7 @@ from colmap_affrect.errors import (
 )
 from colmap_affrect.project import outputs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
+from colmap_affrect.project.feature_summary import summary_path
 from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.record import (
     MADE_FROM,
@@ -49,8 +50,8 @@ OWN_STEMS = {  # how names of files and folders begin that are written here
 }  # fmt: skip
 OWN_FILES = {  # which are never folders
     outputs.LOCK, "cameras.json", "config.toml", "database.db", "database.db.seal",
-    "features.h5", "guided.h5", "mapped.db", "matches.h5", "pairs.txt", "report.html",
-    "report.json", "run.log",
+    "features.h5", "features.json", "guided.h5", "mapped.db", "matches.h5", "pairs.txt",
+    "report.html", "report.json", "run.log",
 }  # fmt: skip
 OWN_FOLDERS = {"sparse", "sparse.best", "sparse.learned", "sparse.snapshots"}
 
@@ -74,6 +75,7 @@ class Workspace:
         # A digest of what the last command left in the database (see colmap_affrect.mend)
         self.seal = path / "database.db.seal"
         self.features = path / "features.h5"  # by image
+        self.features_summary = summary_path(self.features)  # of it, for idle runs
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
@@ -480,7 +482,7 @@ class Workspace:
             "verify": [self.cameras, self.seal, *outputs.database_files(self.database)],
             "match": [self.matches],
             "pairs": [self.pairs],
-            "extract": [self.features],
+            "extract": [self.features, self.features_summary],
         }
         later = STAGES[STAGES.index(stage) :]
         return [path for name, paths in made.items() if name in later for path in paths]

@@ -250,7 +250,7 @@ def _draw_lines(
 ) -> str:
     """Draw the straight lines of a photograph; return what they say."""
     found = lines_of(photograph.gray, photograph.mask)
-    report = line_report(found, original_size)
+    report = line_report(found.findings(), original_size)
     replace_bytes(sheet, line_sheet(photograph.gray, found, report, photograph.mask))
     return f"lines: {report.sentence()}"
 

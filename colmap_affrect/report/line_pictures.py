@@ -112,7 +112,8 @@ def camera_from_lines(
         raise OptionError(
             f"has the shape {mask.shape}, and the photograph {gray.shape}", where="mask"
         )
-    return line_report(lines_of(gray, mask), (gray.shape[1], gray.shape[0]))
+    found = lines_of(gray, mask).findings()
+    return line_report(found, (gray.shape[1], gray.shape[0]))
 
 
 def report_lines(
@@ -141,7 +142,7 @@ def report_lines(
             found.failed[str(path)] = failure_of(error)
             continue
         lines = lines_of(gray)
-        report = line_report(lines, (gray.shape[1], gray.shape[0]))
+        report = line_report(lines.findings(), (gray.shape[1], gray.shape[0]))
         found.photographs[str(path)] = report
         if folder is not None:
             picture = folder / fitting_name(path.name, "-lines.png")

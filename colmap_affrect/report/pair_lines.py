@@ -113,6 +113,7 @@ class LinesOfRun:
 
     def _read(self, pairs: Sequence[Pair], max_num_lines: int) -> PairLines:
         """Read at most so many lines of each pair."""
+        self._reader.look_up_levels(pairs)
         found = PairLines()
         ends = [np.empty((0, 4), dtype="<u2")]
         kinds = [np.empty(0, dtype=np.uint8)]

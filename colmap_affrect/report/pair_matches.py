@@ -1,9 +1,10 @@
 """The matches of a pair of photographs, and what a run knows of each of them."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -68,6 +69,14 @@ class PairReader:
         self.agreement = agreements(self.graph, self.model)
         self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
         self._keypoints = lru_cache(NUM_KEPT)(self._read_keypoints)
+        # Of pairs whose matches are stored, those that were looked up
+        self._levels = dict[Pair, int]()
+
+    @cached_property
+    def _recipe_levels(self) -> list[tuple[str, bool]]:
+        """Name of each level of the recipe on record, and whether its features have shapes."""
+        levels = self.run.extraction.levels if self.run else ()
+        return [(level.name, level.features.has_shapes) for level in levels]
 
     def read(self, names: Pair) -> MatchedPair:
         """Read a pair; OptionError for photographs that are not there or were never matched."""
@@ -113,6 +122,16 @@ class PairReader:
             self._text(names, len(raw), len(inliers)),
         )
 
+    def look_up_levels(self, pairs: Iterable[Pair]) -> None:
+        """Read the levels of many pairs together; for each alone a file would be opened.
+
+        There are none of pairs that another program has matched, nor of a store that is damaged.
+        """
+        ordered = [(min(pair), max(pair)) for pair in pairs]
+        if self.run:
+            with suppress(StoreError):
+                self._levels |= self.run.matches.levels_of_stored(ordered)
+
     def _feature_kinds(
         self, names: Pair, keypoints: list[Array], matches: Indices
     ) -> Indices:
@@ -144,7 +163,8 @@ class PairReader:
         ids = self.run.features.read_rectification_ids(name)
         kinds = np.where(ids, MatchKind.WARPED, MatchKind.OWN)
         for level, rows in self.run.features.level_ranges(name).items():
-            if not self.run.extraction.levels[level].features.has_shapes:
+            _, has_shapes = self._recipe_levels[level]
+            if not has_shapes:
                 kinds[rows.start : rows.stop] = MatchKind.LEARNED
         return kinds
 
@@ -171,10 +191,12 @@ class PairReader:
         text = f"{num_raw} matches"
         if self.run:
             pair = (min(names), max(names))
-            # Another program has matched the pair, and not the run
-            with suppress(StoreError):
-                level = self.run.matches.levels([pair])[pair]
-                text += f" by {self.run.extraction.levels[level].name}"
+            if pair not in self._levels:
+                self.look_up_levels([pair])
+            level = self._levels.get(pair)
+            if level is not None:
+                name, _ = self._recipe_levels[level]
+                text += f" by {name}"
         text += f", {num_inliers} inliers"
         share = self.agreement.get(names, self.agreement.get(names[::-1]))
         if share is not None:

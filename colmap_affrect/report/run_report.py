@@ -18,7 +18,7 @@ from colmap_affrect.errors import (
     such_as,
     with_arguments,
 )
-from colmap_affrect.geometry.lines import LineCamera, Lines
+from colmap_affrect.geometry.lines import LineCamera, LineFindings
 from colmap_affrect.mappers.camera_priors import (
     FocalContradiction,
     focal_contradictions,
@@ -217,7 +217,7 @@ def cameras_of_report(
 
 
 def lines_of_report(
-    features: FeatureStore, lines: Mapping[str, Lines]
+    features: FeatureStore, lines: Mapping[str, LineFindings]
 ) -> dict[str, LineReport]:
     """Return what straight lines say of photographs.
 
@@ -230,7 +230,7 @@ def lines_of_report(
 
 
 def contradictions_of_report(
-    context: Context, lines: Mapping[str, Lines]
+    context: Context, lines: Mapping[str, LineFindings]
 ) -> tuple[FocalContradiction, ...]:
     """Return the focal lengths of EXIF and of the user that straight lines contradict.
 
@@ -244,7 +244,7 @@ def contradictions_of_report(
         if record.source not in TRUSTED:
             continue
         for name in record.names:
-            by_lines = lines[name].camera() if name in lines else None
+            by_lines = lines[name].camera if name in lines else None
             if by_lines is not None:
                 line_cameras[name] = by_lines
     cameras = {}

@@ -7,7 +7,7 @@ from typing import Any
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.escalation.escalate import escalation_summary
-from colmap_affrect.geometry.lines import Lines
+from colmap_affrect.geometry.lines import LineFindings
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import replace_text
@@ -63,10 +63,8 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
     missing = unregistered(context, result.names, result.models, pair_inliers)
     cameras = cameras_of_report(workspace, result.models, result.extended)
-    stored_lines: dict[str, Lines] = {}
-    if not workspace.is_foreign:
-        stored_lines = context.features.lines_of(result.names)
-    lines = lines_of_report(context.features, stored_lines)
+    line_findings = _line_findings(context, result.names)
+    lines = lines_of_report(context.features, line_findings)
     escalated = escalation_summary(context)
     escalates = escalated.matched_again or escalated.untried
     report = RunReport(
@@ -85,7 +83,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         photographs=photographs_of_report(
             workspace, result.names, result.models, cameras, lines
         ),
-        focal_contradictions=contradictions_of_report(context, stored_lines),
+        focal_contradictions=contradictions_of_report(context, line_findings),
         extended=tuple(result.extended),
         advice=advice(
             context,
@@ -105,7 +103,17 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     replace_text(workspace.report, report.to_json())
     if page:
         _write_page(context, result, report, num_inliers=pair_inliers)
+    if not workspace.is_foreign:
+        context.features.keep_summaries()
     return report
+
+
+def _line_findings(context: Context, names: Sequence[str]) -> dict[str, LineFindings]:
+    """Return what the straight lines of photographs say, in the order of the names."""
+    if context.workspace.is_foreign:
+        return {}
+    known = context.features.line_findings()
+    return {name: known[name] for name in names if name in known}
 
 
 def _write_page(

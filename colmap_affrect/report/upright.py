@@ -1,6 +1,7 @@
 """Where up is in the models of runs, by the straight lines of their photographs."""
 
 import logging
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from colmap_affrect.project.paths import resolved
 from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
+
+# Photographs of a model whose lines are read; those of more make it no surer; resource
+MAX_NUM_ASKED = 500
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,9 @@ def turn_upright(model: pycolmap.Reconstruction, upright: Upright) -> None:
 
 def _upright(model: pycolmap.Reconstruction, features: FeatureStore) -> Upright | None:
     images = _registered(model)
-    lines_of_images = features.lines_of(image.name for image in images)
+    step = math.ceil(len(images) / MAX_NUM_ASKED)
+    asked = images[:: max(1, step)]
+    lines_of_images = features.lines_of(image.name for image in asked)
     held = []
     names = []
     directions = []

@@ -305,7 +305,9 @@ class Context:
                 advice="run 'colmap-affrect pairs' and then match again",
             )
         names = self.features.names()
-        return lists.read_pairs(path, names) if len(names) > 1 else PairList.of(())
+        if len(names) < 2:
+            return PairList.of(())
+        return lists.read_pairs_once(path, names)
 
     def usable(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Return the pairs whose images the database has, but those rejected by hand."""

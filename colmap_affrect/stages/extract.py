@@ -88,12 +88,10 @@ def extract(
     if contents != known:  # those that were there before were seen to be good
         warned += inputs.check_names(names)
     without_mask = _mask_warnings(inputs, names)
-    resources = context.resources
-    progress = context.progress
-    extractor = one_image.prepare(recipe.extraction, resources, names, progress)
+    extractor = _prepared(context, recipe, known, contents)
     if not overwrite:
         _refuse_other_photographs(workspace, inputs.image_path, contents)
-    _record(context, inputs, recipe, extractor, later=later or {}, overwrite=overwrite)
+    _record(context, inputs, recipe, later=later or {}, overwrite=overwrite)
     warned += _forget_changed(context, inputs, contents, are_all=not image_names)
     start_database(workspace, inputs)
     done = set(names).intersection(context.features.names())
@@ -115,6 +113,27 @@ def extract(
         num_kept=len(done - failures.keys()),
         failed=failures,
         warned=(*warned, *warned_of_images),
+    )
+
+
+def _prepared(
+    context: Context,
+    recipe: Recipe,
+    known: Mapping[str, Content],
+    now: Mapping[str, Content],
+) -> ImageExtractor | None:
+    """Return what extracts features; None where nothing is to do, and no networks are loaded.
+
+    Args:
+        context: of the workspace.
+        recipe: says which features.
+        known: what the files held that features are from, by image.
+        now: what the files hold, by image.
+    """
+    if known.keys() >= now.keys() and not _changed(known, now):
+        return None
+    return one_image.prepare(
+        recipe.extraction, context.resources, list(now), context.progress
     )
 
 
@@ -149,16 +168,16 @@ def _record(
     context: Context,
     inputs: Inputs,
     recipe: Recipe,
-    extractor: ImageExtractor,
     *,
     later: Mapping[str, Options],
     overwrite: bool,
 ) -> None:
     """Put what was given on record, and the options that later stages take where none are given."""
+    weights = one_image.find_weights(recipe.extraction, context.resources)
     options = {
         **inputs.to_mapping(),
         **recipe.extraction.to_mapping(),
-        WEIGHTS: digests(extractor.weights),
+        WEIGHTS: digests(weights),
     }
     planned = {**recipe.later_stages, **later}
     context.workspace.record_options(
@@ -210,11 +229,13 @@ def _log_warnings(warned: Iterable[StageWarning]) -> None:
 def _extract_missing(
     context: Context,
     inputs: Inputs,
-    extractor: ImageExtractor,
+    extractor: ImageExtractor | None,
     names: Sequence[str],
     contents: Mapping[str, Content],
 ) -> tuple[dict[str, ImageFailure], list[StageWarning]]:
     """Extract images one by one; return why some cannot be used, and warnings of others."""
+    if not extractor:
+        return {}, []
     store = context.features
     images = [(name, 0) for name in names]
     failures = dict[str, ImageFailure]()

@@ -155,10 +155,11 @@ def line_cameras(context: Context) -> dict[str, LineCamera]:
         if record.source == "guess":
             names.extend(record.names)
     found = dict[str, LineCamera]()
-    for name, lines in context.features.lines_of(names).items():
-        camera = lines.camera()
-        if camera:
-            found[name] = camera
+    findings = context.features.line_findings() if names else {}
+    for name in names:
+        lines = findings.get(name)
+        if lines and lines.camera:
+            found[name] = lines.camera
     return found
 
 

@@ -283,6 +283,33 @@ def num_images_at_once(levels: Collection[Level]) -> int:
     return min(most, max(1, available_memory_bytes() // 2 // max(needed)))
 
 
+def find_weights(
+    options: ExtractionOptions, resources: Resources, progress: Progress = SILENT
+) -> dict[str, Path]:
+    """Return the files of weights that extraction needs, by key.
+
+    Args:
+        options: of the recipe.
+        resources: where weights are.
+        progress: where to show downloads.
+
+    Raises:
+        AffrectError: a file of weights is neither found nor downloaded.
+    """
+    keys = set[str]()
+    for level in _usable_levels(options, resources).values():
+        for part in level.network_parts:
+            keys.update(part.weights)
+    return resolve(sorted(keys), resources.weights_path, progress=progress)
+
+
+def _usable_levels(
+    options: ExtractionOptions, resources: Resources
+) -> dict[int, Level]:
+    """Return the levels by number, but those of escalation that wait for weights."""
+    return {k: options.levels[k] for k in resources.usable_levels(options)}
+
+
 def prepare(
     options: ExtractionOptions,
     resources: Resources | None = None,
@@ -309,12 +336,8 @@ def prepare(
     """
     resources = resources or Resources()
     options.check_depth()
-    levels = {k: options.levels[k] for k in resources.usable_levels(options)}
-    keys = set[str]()
-    for level in levels.values():
-        for part in level.network_parts:
-            keys.update(part.weights)
-    weights = resolve(sorted(keys), resources.weights_path, progress=progress)
+    levels = _usable_levels(options, resources)
+    weights = find_weights(options, resources, progress)
     uses_network = any(level.uses_networks for level in levels.values())
     network = NetworkContext(
         weights, resources.require_device(uses_network=uses_network)

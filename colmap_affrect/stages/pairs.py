@@ -12,7 +12,7 @@ from colmap_affrect.errors import AffrectError, Logged, Option, such_as
 from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import Pair, PairOptions
 from colmap_affrect.pairs.retrieval import retrieved_pairs
-from colmap_affrect.project.record import content_of
+from colmap_affrect.project.record import content_of, file_sha256
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.session.context import Context
@@ -66,7 +66,8 @@ def choose_pairs(
         kept = set()
     pairs |= kept | _similar_pairs(context, options, there=kept)
     warned = _forget_lost(context, there - pairs)
-    lists.write_pairs(workspace.pairs, sorted(pairs))
+    if pairs != there or not _is_matched_list(context):
+        lists.write_pairs(workspace.pairs, sorted(pairs))
     workspace.record_input_digests(pairs=digest)
     return StageReport(
         name="pairs",
@@ -74,6 +75,11 @@ def choose_pairs(
         num_done=len(pairs),
         warned=warned,
     )
+
+
+def _is_matched_list(context: Context) -> bool:
+    """Return whether all pairs of the list were matched, and nobody has written it anew since."""
+    return context.matches.state.listed == file_sha256(context.workspace.pairs)
 
 
 def _list_all_pairs(context: Context, options: PairOptions, *, overwrite: bool) -> int:
@@ -119,7 +125,7 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
         named = known.union(context.inputs.names())  # some may have gone just now
-        listed = lists.read_pairs(
+        listed = lists.read_pairs_once(
             Path(options.match_list_path),
             names=sorted(named),
             image_path=Path(context.inputs.image_path),

@@ -1,19 +1,23 @@
-"""Time, memory and errors of ``run`` on many images. Usage:
+"""Time and memory of each stage of ``run``, and its errors, on more and more images. Usage:
 
-    python tests/benchmarks/many_images.py --output-path out/many --num-images 1000
+    python tests/benchmarks/many_images.py --output-path out/many --num-images 50 200 1000
 
 Renders photographs of a street of different houses from random places, once, seven to the metre,
-and runs the command on them. Prints the seconds of its stages, the largest memory of a process, and
-how many images of the largest model are where they were rendered.
+and runs the command on the first of them. Prints, for each number, the processor time of each stage
+(all threads and child processes) and the largest memory that the process had while it worked, and
+how many images of the largest model are where they were rendered; ``costs.json`` has the same. A
+stage that takes ``n`` times as long for ``n`` times as many images has a growth of 1.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from pathlib import Path
@@ -145,48 +149,182 @@ def scores(model_path: Path, count: int) -> str:
     )
 
 
+def stage_functions() -> list[tuple[Any, str, str]]:
+    """Return where the functions of stages are looked up: module or class, name, stage."""
+    from colmap_affrect import pipeline
+    from colmap_affrect.escalation import map_and_rematch
+    from colmap_affrect.escalation.escalate import Escalation
+
+    return [
+        # of the pipeline and of what maps and matches again
+        (pipeline, "extract_features", "extract"),
+        (pipeline, "list_pairs", "pairs"),
+        (pipeline, "match_pairs", "match"),
+        (pipeline, "verify_pairs", "verify"),
+        (pipeline, "guide", "guide"),
+        (map_and_rematch, "guide", "guide"),
+        (map_and_rematch, "map_images", "map"),
+        (map_and_rematch, "_try_learned_matches", "learned"),
+        (Escalation, "take_steps", "escalate"),
+        (pipeline, "map_pairs", "map"),
+        (pipeline, "write_results", "report"),
+    ]
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and of its children that have ended."""
+    own = os.times()
+    return own.user + own.system + own.children_user + own.children_system
+
+
+def peak_mib(*, forget: bool = False) -> float:
+    """Return the largest memory that this process has had since it was last forgotten."""
+    if forget:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024  # KiB
+    return math.nan
+
+
+def run_measured(costs_path: Path, command: Sequence[str]) -> int:
+    """Run the command line in this process, and write what its stages cost.
+
+    Args:
+        costs_path: of the JSON file.
+        command: what follows ``colmap-affrect``.
+
+    Returns:
+        Its exit code.
+    """
+    from colmap_affrect.cli import main as run_command
+
+    costs: dict[str, list[float]] = {}
+
+    def measured(function: Callable[..., Any], stage: str) -> Callable[..., Any]:
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            begin_s = processor_s()
+            peak_mib(forget=True)
+            try:
+                return function(*arguments, **keywords)
+            finally:
+                known_s, known_mib = costs.get(stage, (0.0, 0.0))
+                took_s = processor_s() - begin_s
+                costs[stage] = [known_s + took_s, max(known_mib, peak_mib())]
+
+        return call
+
+    for place, name, stage in stage_functions():
+        setattr(place, name, measured(getattr(place, name), stage))
+    code = run_command(command)
+    in_stages_s = sum(took_s for took_s, _ in costs.values())
+    costs["other"] = [processor_s() - in_stages_s, 0.0]
+    costs_path.write_text(json.dumps(costs), encoding="utf-8")
+    return code
+
+
+def measure(folder: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
+    """Run on the first images, twice: the second run finds everything done.
+
+    Args:
+        folder: that has ``images``; each number of images gets a folder of results in it.
+        count: number of images.
+        options: of ``run``.
+
+    Returns:
+        By ``first`` and ``idle``: seconds and MiB of each stage.
+    """
+    listed = folder / f"names-{count}.txt"
+    names = [file_name(number) for number in range(count)]
+    listed.write_text("\n".join(names), encoding="utf-8")
+    out = folder / f"run-{count}"
+    width, height = IMAGE_SIZE
+    parameters = f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{width / 2},{height / 2}"
+    command = [
+        *("run", "--quiet", "--image-path", str(folder / "images")),
+        *("--image-list-path", str(listed), "--output-path", str(out)),
+        *("--camera-mode", "single", "--camera-model", "PINHOLE"),
+        *("--camera-params", parameters, *options),
+    ]
+    costs_path = folder / "costs-of-run.json"
+    found: dict[str, Any] = {"num_images": count}
+    for kind, more in (("first", ["--overwrite"]), ("idle", [])):
+        own = [
+            *(sys.executable, str(Path(__file__).resolve())),
+            *("--output-path", str(folder), "--measure-run", str(costs_path), "--"),
+        ]
+        begin_s = time.monotonic()
+        subprocess.run([*own, *command, *more], check=True, stdout=subprocess.DEVNULL)
+        found[f"{kind}_wall_s"] = time.monotonic() - begin_s
+        found[kind] = json.loads(costs_path.read_text(encoding="utf-8"))
+    costs_path.unlink()
+    found["scores"] = scores(out / "sparse" / "0", count)
+    return found
+
+
+def rows_of(found: Sequence[dict[str, Any]], kind: str) -> list[list[str]]:
+    """Return a row for each stage: seconds and memory by number of images, and the growth.
+
+    Args:
+        found: what :func:`measure` returned, by rising number of images.
+        kind: ``first`` or ``idle``.
+    """
+    stages = dict.fromkeys(stage for one in found for stage in one[kind])
+    rows = []
+    for stage in stages:
+        cells = [stage]
+        seconds = [one[kind].get(stage, (0.0, 0.0))[0] for one in found]
+        for one, took_s in zip(found, seconds, strict=True):
+            memory_mib = one[kind].get(stage, (0.0, 0.0))[1]
+            cells.append(f"{took_s:.1f} s, {memory_mib:.0f} MiB")
+        growth = math.nan
+        if len(found) > 1 and seconds[-2] > 0.0 and seconds[-1] > 0.0:
+            more = found[-1]["num_images"] / found[-2]["num_images"]
+            growth = math.log(seconds[-1] / seconds[-2]) / math.log(more)
+        rows.append([*cells, f"{growth:.1f}"])
+    return rows
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = parser_of(__doc__)
-    parser.add_argument("--output-path", type=Path, required=True)
-    parser.add_argument("--num-images", type=int, default=1000)
+    parser.add_argument(
+        "--output-path",
+        type=Path,
+        required=True,
+        help="folder of photographs, results and costs.json",
+    )
+    parser.add_argument(
+        "--num-images",
+        type=int,
+        nargs="+",
+        default=[1000],
+        help="numbers of images, each of which is run on",
+    )
+    parser.add_argument("--measure-run", type=Path, help="JSON file; runs OPTIONS once")
     parser.add_argument(
         "options", nargs="*", help="of run, after --; default: --pairs retrieval"
     )
     arguments = parser.parse_args()
+    if arguments.measure_run:
+        sys.exit(run_measured(arguments.measure_run, arguments.options))
     photographs = arguments.output_path / "images"
-    out = arguments.output_path / "run"
     photographs.mkdir(parents=True, exist_ok=True)
-    take_photographs(photographs, arguments.num_images)
-    parameters = (
-        f"{FOCAL_LENGTH_PX},{FOCAL_LENGTH_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"
-    )
-    command = [
-        *(sys.executable, "-m", "colmap_affrect", "run", "--overwrite"),
-        *("--image-path", str(photographs), "--output-path", str(out)),
-        *(
-            "--camera-mode",
-            "single",
-            "--camera-model",
-            "PINHOLE",
-            "--camera-params",
-            parameters,
-        ),
-        *(arguments.options or ("--pairs", "retrieval")),
-    ]
+    counts = sorted(arguments.num_images)
+    take_photographs(photographs, counts[-1])
     print(describe_machine())
-    _, status, usage = os.wait4(subprocess.Popen(command).pid, 0)
-    if status:
-        raise SystemExit(f"the run ended with {os.waitstatus_to_exitcode(status)}")
-    stages = json.loads((out / "report.json").read_text(encoding="utf-8"))["stages"]
-    print(
-        table(
-            ("stage", "seconds"),
-            [(each["name"], f"{each['wall_s']:.0f}") for each in stages],
+    found = []
+    for count in counts:
+        options = arguments.options or ("--pairs", "retrieval")
+        found.append(measure(arguments.output_path, count, options))
+        (arguments.output_path / "costs.json").write_text(
+            json.dumps(found, indent=1), encoding="utf-8"
         )
-    )
-    print(f"memory at most: {usage.ru_maxrss / 2**20:.2f} GiB")  # of a process, KiB
-    print(scores(out / "sparse" / "0", arguments.num_images))
+    header = ("stage", *[f"{count} images" for count in counts], "growth")
+    for kind in ("first", "idle"):
+        print(f"{kind} run\n\n{table(header, rows_of(found, kind))}")
+    for one in found:
+        print(one["scores"])
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.pairs import lists
 from colmap_affrect.pairs.lists import (
     Pair,
     exhaustive_pairs,
     most_similar_pairs,
     ordered_for_reuse,
     read_pairs,
+    read_pairs_once,
     sequence_pairs,
     write_pairs,
 )
@@ -228,6 +231,37 @@ IMAGE_NAMES = st.lists(
     max_size=6,
     unique=True,
 )
+
+
+@pytest.mark.parametrize(("names", "text", "pair"), [
+    (["a", "b", " a"], " a b", (" a", "b")),
+    (["a", "b", "b "], "a b ", ("a", "b ")),
+    (["a", "b", "a,b", "c", "b c"], "a,b c\n", ("a", "b c")),
+    (["a", "b"], "b a\n", ("a", "b")),
+])  # fmt: skip
+def test_names_of_lines_that_look_plain_may_have_separators(
+    pair_list: Path, names: list[str], text: str, pair: Pair
+) -> None:
+    pair_list.write_text(text)
+    assert list(read_pairs(pair_list, names)) == [pair]
+
+
+def test_a_list_is_read_once_while_nobody_writes_it(
+    pair_list: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["a.png", "b.png", "c.png"]
+    read = Mock(wraps=lists.read_pairs)
+    monkeypatch.setattr(lists, "read_pairs", read)
+    write_pairs(pair_list, [("a.png", "b.png")])
+    for _ in range(2):
+        assert list(read_pairs_once(pair_list, names)) == [("a.png", "b.png")]
+    assert read.call_count == 1
+    write_pairs(pair_list, [("a.png", "c.png")])  # as long, perhaps within one tick
+    assert list(read_pairs_once(pair_list, names)) == [("a.png", "c.png")]
+    assert list(read_pairs_once(pair_list, names[:1] + names[2:])) == [
+        ("a.png", "c.png")
+    ]
+    assert read.call_count == 3
 
 
 @given(names=IMAGE_NAMES)

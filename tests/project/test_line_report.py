@@ -120,7 +120,9 @@ def test_what_hloc_reads_of_an_image_is_numbers_as_before(tmp_path: Path) -> Non
 
 
 def test_a_report_is_in_px_of_the_photograph_and_in_mm_for_film_of_36_mm() -> None:
-    report = line_report(peaked(1.0, 0.0), (1000, 2000))  # the longer side is 2000 px
+    report = line_report(
+        peaked(1.0, 0.0).findings(), (1000, 2000)
+    )  # the longer side is 2000 px
     assert report.is_known
     assert not report.is_shifted
     assert report.focal_px == pytest.approx(2000.0, rel=0.03)
@@ -137,14 +139,14 @@ def test_a_report_is_in_px_of_the_photograph_and_in_mm_for_film_of_36_mm() -> No
 
 @pytest.mark.parametrize(("shift", "side"), [(0.2, "below"), (-0.2, "above")])
 def test_a_shift_is_said_with_its_side(shift: float, side: str) -> None:
-    report = line_report(peaked(1.0, shift), (2000, 1000))
+    report = line_report(peaked(1.0, shift).findings(), (2000, 1000))
     assert report.is_shifted
     assert report.shift_px == pytest.approx(2000.0 * shift, rel=0.1)
     assert f"px {side} the middle" in report.sentence()
 
 
 def test_few_lines_and_open_focal_lengths_are_said() -> None:
-    report = line_report(few(), (2000, 1000))
+    report = line_report(few().findings(), (2000, 1000))
     assert report == LineReport(num_segments=6)
     assert (
         "6 straight lines are too few to say anything, 12 are needed"
@@ -153,7 +155,7 @@ def test_few_lines_and_open_focal_lengths_are_said() -> None:
     nothing = np.zeros((len(FOCALS), len(SHIFTS)))
     rotations = np.tile(np.eye(3), (*nothing.shape, 1, 1))
     open_lines = Lines(peaked(1.0, 0.0).segments, LineLikelihood(nothing, rotations))
-    said = line_report(open_lines, (2000, 1000))
+    said = line_report(open_lines.findings(), (2000, 1000))
     assert not said.is_known
     assert "do not tell the focal length" in said.sentence()
     assert said.focal_px == pytest.approx(2000.0 * line_cameras.USUAL_FOCAL, rel=0.03)

@@ -254,6 +254,24 @@ def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore) ->
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
 
 
+def test_levels_are_told_of_the_pairs_that_are_stored(matches: MatchStore) -> None:
+    pairs = [("a.png", "b.png"), ("a.png", "c.png")]
+    for level, names in enumerate(pairs):
+        matches.write(
+            [
+                PairMatches(
+                    names,
+                    indices=np.array([(0, 1)], np.int64),
+                    scores=np.ones(1, np.float32),
+                    num_keypoints1=4,
+                    level=level,
+                )
+            ]
+        )
+    found = matches.levels_of_stored([*pairs, ("b.png", "c.png")])
+    assert found == {pairs[0]: 0, pairs[1]: 1}
+
+
 def test_file_that_somebody_else_has_written_is_read_again(store: FeatureStore) -> None:
     store.write("a.png", some_features(2), (8, 6))
     assert store.num_keypoints() == {"a.png": 2}

@@ -62,7 +62,7 @@ def test_a_picture_has_lines_in_the_colours_of_their_directions(
     drawing: GrayImage,
 ) -> None:
     lines = lines_of(drawing)
-    data = line_sheet(drawing, lines, line_report(lines, SIZE))
+    data = line_sheet(drawing, lines, line_report(lines.findings(), SIZE))
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
     panel = picture[48:, :1592]  # below the sentence and the legend
     scale = 1592 / SIZE[0]

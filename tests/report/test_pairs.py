@@ -8,10 +8,11 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -35,11 +36,13 @@ from colmap_affrect.report.pair_lines import (
     MAX_NUM_PAIRS_IN_FILES,
     MIN_NUM_LINES_OF_PAIR,
     NUM_PAIRS_OF_FILE,
+    LinesOfRun,
     num_lines_of_pair,
 )
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind, PairReader
 from colmap_affrect.report.pairs import COLORS, draw_matches
 from colmap_affrect.report.sheets import WIDTH_PX, rgb
+from colmap_affrect.session import view_graph
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
 
@@ -142,7 +145,9 @@ class Stores(SimpleNamespace):
     def level_ranges(self, _: str) -> dict[int, range]:
         return {0: range(60), 1: range(60, 1000)}
 
-    def levels(self, asked: list[tuple[str, str]]) -> dict[tuple[str, str], int]:
+    def levels_of_stored(
+        self, asked: list[tuple[str, str]]
+    ) -> dict[tuple[str, str], int]:
         return dict.fromkeys(asked, 1)
 
 
@@ -353,3 +358,17 @@ def test_files_beside_the_page_are_small_and_all_of_them_can_be_kept() -> None:
     num_bytes = 4 / 3 * 9 * MIN_NUM_LINES_OF_PAIR + 100
     assert 1e6 < num_bytes * NUM_PAIRS_OF_FILE < 3e6
     assert 20e6 < num_bytes * MAX_NUM_PAIRS_IN_FILES < 50e6
+
+
+def test_images_are_read_once_for_all_pairs_and_levels_together(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stores: Any = Stores(scene, ["match"])
+    levels = Mock(wraps=stores.levels_of_stored)
+    monkeypatch.setattr(stores, "levels_of_stored", levels)
+    images = Mock(wraps=view_graph._read_images)
+    monkeypatch.setattr(view_graph, "_read_images", images)
+    reader = PairReader(ViewGraph(scene / "database.db"), stores)
+    lines = LinesOfRun(reader, NAMES, dict.fromkeys(combinations(NAMES, 2), 30))
+    assert len(lines.of_page().pairs) == 15
+    assert (images.call_count, levels.call_count) == (1, 1)

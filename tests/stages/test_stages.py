@@ -33,6 +33,7 @@ from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers.base import ImageFeatures
 from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors
 from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project import feature_store
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_store import pair_key
 from colmap_affrect.project.reasons import Doubt
@@ -44,6 +45,7 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import advice as advice_module
+from colmap_affrect.report import upright
 from colmap_affrect.report.advice import advice
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages import match as match_stage
@@ -366,6 +368,37 @@ def test_idle_run_looks_at_no_header(
     monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
     monkeypatch.setattr("colmap_affrect.project.match_store.MatchStore.has", None)
     run(photos, copy.path, OPTIONS)
+
+
+def test_idle_run_reads_the_features_of_no_photograph_and_builds_no_networks(
+    copy: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy has other times than its summaries name; the first run makes them again.
+
+    The page asks up to so many photographs for their lines, whose directions are not in summaries.
+    """
+    monkeypatch.setattr(upright, "MAX_NUM_ASKED", 1)
+    first = run(photos, copy.path, OPTIONS)
+    feature_store._forget_summaries()
+    read = Mock(wraps=feature_store._line_datasets)
+    monkeypatch.setattr(feature_store, "_line_datasets", read)
+    monkeypatch.setattr(feature_store, "entries_of", None)
+    monkeypatch.setattr("colmap_affrect.stages.one_image.prepare", None)
+    again = run(photos, copy.path, OPTIONS)
+    assert read.call_count == 1
+    assert without_times(again.to_mapping()) == without_times(first.to_mapping())
+
+
+def test_summaries_that_are_removed_change_no_result(
+    copy: Workspace, photos: Path
+) -> None:
+    before = run(photos, copy.path, OPTIONS)
+    copy.features_summary.unlink()
+    feature_store._forget_summaries()
+    after = run(photos, copy.path, OPTIONS)
+    assert copy.features_summary.exists()
+    assert without_times(after.to_mapping()) == without_times(before.to_mapping())
+    assert {stage.num_done for stage in after.stages} == {0, 6}  # pairs are listed
 
 
 def test_pairs_are_given_up_where_those_of_a_dozen_photographs_or_more_are_listed(
