@@ -330,10 +330,7 @@ def _codes(
     """
     number = {name: index for index, name in enumerate(names)}
     for line_number, line in _without_comments(lines, [*names, *folders]):
-        pair = _two_words(line, number)
-        pair = pair or split_line(line.rstrip("\n"), number)
-        pair = pair or split_line(line.strip(), number)
-        pair = pair or split_of_others(line, number, folders)
+        pair = _pair_of_line(line, number, folders)
         if pair:
             low, high = sorted((number[pair[0]], number[pair[1]]))
             if low < high:
@@ -342,6 +339,22 @@ def _codes(
             problems.append((line_number, line.strip()))
             if len(problems) > MAX_PROBLEMS:
                 return
+
+
+def _pair_of_line(
+    line: str, number: Mapping[str, int], folders: Sequence[str]
+) -> Pair | None:
+    """Return the names of a line by any of the ways in which lists are written.
+
+    Args:
+        line: With its end.
+        number: Has the names.
+        folders: That paths may begin with.
+    """
+    pair = _two_words(line, number)
+    pair = pair or split_line(line.rstrip("\n"), number)
+    pair = pair or split_line(line.strip(), number)
+    return pair or split_of_others(line, number, folders)
 
 
 def _without_comments(

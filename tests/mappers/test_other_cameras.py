@@ -13,7 +13,7 @@ from mapping_tasks import mapper_of, synthesize
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.mappers import sparse
+from colmap_affrect.mappers import hypotheses
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
 from colmap_affrect.mappers.own_cameras import one_camera
@@ -94,7 +94,9 @@ def test_photographs_of_one_camera_stay_where_they_are_with_own_ones(
 def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sparse, "MIN_SCORE_GAIN", 1e9)  # so that cameras stay shared
+    monkeypatch.setattr(
+        hypotheses, "MIN_SCORE_GAIN", 1e9
+    )  # so that cameras stay shared
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
     task = task_of(path, truth)
