@@ -106,8 +106,9 @@ def models_digest(sparse: Path) -> str:
         model = pycolmap.Reconstruction(folder)
         for image_id in sorted(model.reg_image_ids()):
             image = model.images[image_id]
-            parts += [image.name, np.asarray(image.cam_from_world().matrix())]
-            parts.append(np.asarray(image.camera.params))
+            # Copies: what they are views of is gone with the model
+            parts += [image.name, np.array(image.cam_from_world().matrix())]
+            parts.append(np.array(image.camera.params))
         points = sorted(tuple(point.xyz.tolist()) for point in model.points3D.values())
         parts.append(np.asarray(points))
     return digest(*parts)
