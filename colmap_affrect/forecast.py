@@ -44,7 +44,7 @@ class Forecast:
         clock: Callable[[], float] = time.monotonic,
         *,
         num_learned_pairs: int = 0,
-        goes_on: bool = True,
+        more_may_follow: bool = True,
         megapixels: float = 0.0,
         num_cores: int = 1,
         is_new: bool = True,
@@ -56,7 +56,7 @@ class Forecast:
             num_pairs: pairs that will be matched.
             clock: seconds from anywhere on.
             num_learned_pairs: pairs that learned matching takes if the first model needs it.
-            goes_on: whether anything may follow the first model.
+            more_may_follow: whether anything may follow the first model.
             megapixels: of all photographs at the size of processing, by which a run is forecast
                 until something is measured; 0: it is not.
             num_cores: that work at once.
@@ -68,7 +68,7 @@ class Forecast:
             core_s = CORE_S_PER_MEGAPIXEL * megapixels
             self._expected_unit_s = core_s / num_images / max(1, num_cores)
         self._num_cores = max(1, num_cores)
-        self._goes_on = goes_on
+        self._more_may_follow = more_may_follow
         self._is_new = is_new
         self._learned_cost = 0.0
         if num_learned_pairs:
@@ -161,7 +161,7 @@ class Forecast:
             return None
         pace = self._pace(now_s)
         least_s = here_s + pace * sum(self._ahead.values())
-        if not self._goes_on:
+        if not self._more_may_follow:
             return least_s, least_s
         after_s = pace * self._learned_cost
         if not after_s:

@@ -160,7 +160,9 @@ def test_a_run_of_unknown_photographs_is_forecast_when_it_has_lasted_a_while() -
 
 def test_a_run_that_goes_on_is_forecast_when_it_is_known_what_is_left() -> None:
     clock = Clock()
-    forecast = Forecast(10, 0, clock, goes_on=False, megapixels=20.0, is_new=False)
+    forecast = Forecast(
+        10, 0, clock, more_may_follow=False, megapixels=20.0, is_new=False
+    )
     assert forecast.left_s() is None
     forecast.begin("extract", 1)
     assert forecast.left_s() is not None
@@ -170,7 +172,7 @@ def test_what_is_at_work_says_how_long_the_run_still_takes() -> None:
     clock = Clock()
     voice = Voice(clock)
     progress = Progress(io.StringIO(), voice=voice)
-    forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0)
+    forecast = Forecast(10, 45, clock, more_may_follow=False, megapixels=20.0)
     progress.with_forecast(
         forecast
     )  # what was made before speaks for the whole command
@@ -182,7 +184,7 @@ def test_what_is_at_work_says_how_long_the_run_still_takes() -> None:
 
 def test_where_nothing_may_follow_the_first_model_one_forecast_is_told() -> None:
     clock = Clock()
-    forecast = Forecast(10, 45, clock, num_learned_pairs=45, goes_on=False)
+    forecast = Forecast(10, 45, clock, num_learned_pairs=45, more_may_follow=False)
     run_stage(clock, forecast, "extract", 10, 2.0)
     ends_s = forecast.least_and_most_s()
     assert ends_s is not None
@@ -211,7 +213,9 @@ def test_a_run_is_forecast_by_its_megapixels_before_a_photograph_is_done(
     """Ten photographs of two megapixels take ten seconds on three cores, after what is loaded."""
     monkeypatch.setattr("os.cpu_count", lambda: 3)
     clock = Clock()
-    forecast = Forecast(10, 45, clock, goes_on=False, megapixels=20.0, num_cores=3)
+    forecast = Forecast(
+        10, 45, clock, more_may_follow=False, megapixels=20.0, num_cores=3
+    )
     adjusting = 2 * COSTS["map"]
     units = 10 * (1 + MAP_CORE_S / (2 * CORE_S_PER_MEGAPIXEL)) + adjusting
     units += 45 * (COSTS["match"] + COSTS["verify"])

@@ -51,14 +51,14 @@ def map_and_rematch(
     is_untouched = not is_chosen and not escalation.has_stepped
     if is_untouched and context.matches.state.learned_matching:
         update_keypoints_of_models(context)
-    goes_on = True
-    while goes_on:
+    is_unfinished = True
+    while is_unfinished:
         escalation.take_steps(before_each=partial(keep_best, context))
         before = context.workspace.model_inputs()
         reports += _map_on(context, mapper, recipe)
         # Nothing changes where no pair makes a model, or all are mapped.
         has_mapped = context.workspace.model_inputs() != before
-        goes_on = (
+        is_unfinished = (
             has_mapped
             or restore_best(escalation)
             or choose_learned(escalation, at_once=False)
@@ -94,4 +94,4 @@ def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageRe
 def _map_on(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageReport]:
     """Map what has changed, from the models that are there."""
     guided = guide(context, recipe.guided)
-    return [guided, map_images(context, mapper, goes_on=True)[0]]
+    return [guided, map_images(context, mapper, begins_with_models=True)[0]]

@@ -264,7 +264,7 @@ def forecast_of(
         num_images,
         num_pairs,
         num_learned_pairs=num_learned,
-        goes_on=len(levels) > 1,
+        more_may_follow=len(levels) > 1,
         megapixels=megapixels,
         num_cores=available_cores(),
         is_new=is_new,

@@ -61,7 +61,7 @@ def sure_few_matches(
         return []
     cameras = cameras_of_images(database)
     options = VerificationOptions()
-    closures = _Closures({**raw, **verified})
+    third_images = _ThirdImages({**raw, **verified})
     found = list[FewMatches]()
     for ids, matches in sorted(raw.items()):
         first, second = ids
@@ -81,7 +81,7 @@ def sure_few_matches(
             keypoints=points,
             max_error_px=options.max_error_px,
         )
-        evidence = max(of_chance, 0.0) + closures.log10_evidence(ids, inliers)
+        evidence = max(of_chance, 0.0) + third_images.log10_evidence(ids, inliers)
         if evidence >= options.min_significance:
             found.append(FewMatches(ids, inliers, geometry))
     return found
@@ -159,7 +159,7 @@ def _geometry(
     return geometry
 
 
-class _Closures:
+class _ThirdImages:
     """Tells whether third images confirm the matches of a pair."""
 
     def __init__(self, matches: Mapping[Ids, Indices]) -> None:

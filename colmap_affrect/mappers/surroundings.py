@@ -48,7 +48,7 @@ TIED = 1.5  # of a pair: as much as about ten cells tell that are all found (the
 ONE_PLACE = 3.0  # log odds beforehand of one place, twenty to one (theory)
 # Share of the cells of the smaller region that two regions share; judged
 MAX_COMMON = 0.1
-CLUMP = 1.25
+CLUSTER_SIZE = 1.25
 """Matches that come together: few of them leave cells empty by chance. Measured: with 1 right
 photographs of an old print look like another place, with 1.5 two places with one statue do not."""
 MIN_EXPECTED = 8  # cells, an eighth of a photograph: less tells nothing (judged)
@@ -166,7 +166,7 @@ class _Views:
         return set(cells[is_shared].tolist())
 
     def overlap_with(
-        self, target: int, sources: Collection[int], clump: float = 1.0
+        self, target: int, sources: Collection[int], cluster_size: float = 1.0
     ) -> Overlap:
         """Return what is expected in an image of all that others see, and what of it is found.
 
@@ -175,14 +175,14 @@ class _Views:
         Args:
             target: The image.
             sources: The others.
-            clump: Matches that come together.
+            cluster_size: Matches that come together.
         """
         expected = [self._expected(source, target) for source in sources]
         ids = np.concatenate([points.ids for points in expected])
         cells = np.concatenate([points.cells for points in expected])
         is_found = np.concatenate([points.is_found for points in expected])
         _, first_rows = np.unique(ids, return_index=True)
-        return _counted(cells[first_rows], is_found[first_rows], clump)
+        return _counted(cells[first_rows], is_found[first_rows], cluster_size)
 
     def _expected(self, source: int, target: int) -> _Expected:
         """Return the points of the source that are expected in the target."""
@@ -264,7 +264,7 @@ def _projected(camera: pycolmap.Camera, local: Array) -> Array:
     return points_px
 
 
-def _counted(cells: Indices, is_found: Bools, clump: float) -> Overlap:
+def _counted(cells: Indices, is_found: Bools, cluster_size: float) -> Overlap:
     """Count the cells that have matches, and those that would if matches were where points are.
 
     Few matches are in few cells, wherever they are.
@@ -272,14 +272,14 @@ def _counted(cells: Indices, is_found: Bools, clump: float) -> Overlap:
     Args:
         cells: (N,) number of the cell of each point that is expected.
         is_found: (N,) whether it is found.
-        clump: Matches that come together.
+        cluster_size: Matches that come together.
     """
     num_points = np.bincount(cells, minlength=GRID * GRID)
     num_found = np.bincount(cells, weights=is_found, minlength=GRID * GRID)
     counts = num_points >= MIN_POINTS
-    num_clumps = float(num_found[counts].sum()) / clump
+    num_clusters = float(num_found[counts].sum()) / cluster_size
     shares = num_points[counts] / max(num_points[counts].sum(), 1)
-    num_expected = float((1.0 - (1.0 - shares) ** num_clumps).sum())
+    num_expected = float((1.0 - (1.0 - shares) ** num_clusters).sum())
     num_occupied = float((num_found[counts] > 0).sum())
     return Overlap(max(num_expected, num_occupied), num_occupied)
 
@@ -404,7 +404,7 @@ def _best_merger(
         partners = _partners_between(first, second, pairs)
         between = list[Overlap]()
         for image_id, others in partners.items():
-            between.append(views.overlap_with(image_id, others, CLUMP))
+            between.append(views.overlap_with(image_id, others, CLUSTER_SIZE))
         log_ratio = _joint_log_ratio(between)
         is_better = log_ratio > highest or (best is None and log_ratio == highest)
         if partners and is_better:

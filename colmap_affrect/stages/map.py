@@ -36,7 +36,7 @@ def map_images(
     mapper: Mapper,
     extend: Extension | None = None,
     *,
-    goes_on: bool = False,
+    begins_with_models: bool = False,
     overwrite: bool = False,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
@@ -45,7 +45,7 @@ def map_images(
         context: of the workspace, whose pairs are verified.
         mapper: what makes models.
         extend: the model that images are registered into; None: models begin anew.
-        goes_on: models begin with those that are there.
+        begins_with_models: models begin with those that are there.
         overwrite: discard the models that are there.
 
     Returns:
@@ -80,7 +80,7 @@ def map_images(
     known_models = read_summaries(workspace.sparse)  # refuses edited ones
     said_before = known.by_hand if known else ""
     before = list[MappedModel]()
-    if goes_on and said_before == inputs.by_hand:
+    if begins_with_models and said_before == inputs.by_hand:
         before = _models_before(workspace.sparse, known_models)
     context.graph.close()  # mappers open the database, and SQLite's own copy copies it
     task = _task(context, extend, before)

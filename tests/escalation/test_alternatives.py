@@ -338,7 +338,7 @@ def test_best_models_and_their_matches_come_back(
     tried = context.matches.levels(escalation.state.pairs, "tried")
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
     assert (
-        map_images(context, mapper, goes_on=True)[0].num_done == 0
+        map_images(context, mapper, begins_with_models=True)[0].num_done == 0
     )  # nothing is mapped anew
     assert not restore_best(escalation)
     remove_alternatives(context)
@@ -508,7 +508,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
         assert levels(context) == {1}
         assert read_summaries(context.workspace.sparse) == learned_models
         assert not context.workspace.learned.exists()
-        assert map_images(context, mapper, goes_on=True)[0].num_done == 0
+        assert map_images(context, mapper, begins_with_models=True)[0].num_done == 0
         model = pycolmap.Reconstruction(context.workspace.sparse / "0")
         with open_database(context.workspace.database) as database:
             for image in model.images.values():

@@ -25,7 +25,7 @@ from colmap_affrect.mappers import few_matches
 from colmap_affrect.mappers.few_matches import (
     MAX_RAW,
     MIN_INLIER_SHARE,
-    _Closures,
+    _ThirdImages,
     sure_few_matches,
 )
 from colmap_affrect.mappers.mapping import map_database
@@ -146,7 +146,7 @@ def test_a_third_image_may_contradict_a_tenth_of_the_matches_that_it_confirms(
         (1, 3): np.stack([first, third], axis=1),
         (2, 3): np.stack([of_third, third], axis=1),
     }
-    evidence = _Closures(matches).log10_evidence((1, 2), matches[1, 2])
+    evidence = _ThirdImages(matches).log10_evidence((1, 2), matches[1, 2])
     num_agreeing = 20 - num_wrong
     choices = math.log10(math.comb(20, num_wrong))  # which of them agree
     expected = num_agreeing * math.log10(20.0) - choices if is_confirmed else 0.0
@@ -175,9 +175,9 @@ def test_of_two_third_images_the_better_one_counts_as_if_chance_had_tried_both()
     same = np.stack([np.arange(10), np.arange(10)], axis=1)
     one = {(1, 2): rows, (1, 3): same, (2, 3): rows[:, ::-1]}
     two = {**one, (1, 4): same, (2, 4): rows[:, ::-1]}
-    by_one = _Closures(one).log10_evidence((1, 2), rows)
+    by_one = _ThirdImages(one).log10_evidence((1, 2), rows)
     assert by_one == pytest.approx(10.0)
-    by_two = _Closures(two).log10_evidence((1, 2), rows)
+    by_two = _ThirdImages(two).log10_evidence((1, 2), rows)
     assert by_two == pytest.approx(10.0 - np.log10(2.0))
 
 
@@ -187,9 +187,9 @@ def test_chance_matches_any_feature_that_the_second_image_has_in_common_with_the
     """The third image has 10 features with the first one, and 40 with the second one."""
     ten = np.stack([np.arange(10), np.arange(10)], axis=1)
     forty = np.stack([np.arange(40), np.arange(40)], axis=1)
-    closures = _Closures({(1, 2): ten, (1, 3): ten, (2, 3): forty})
+    third_images = _ThirdImages({(1, 2): ten, (1, 3): ten, (2, 3): forty})
     expected = 10.0 * math.log10(40.0)
-    assert closures.log10_evidence((1, 2), ten) == pytest.approx(expected)
+    assert third_images.log10_evidence((1, 2), ten) == pytest.approx(expected)
 
 
 def test_few_matches_that_chance_explains_are_sure_where_third_images_confirm_them(

@@ -32,7 +32,7 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import Confidence
 from colmap_affrect.mappers.scored_models import no_surer_than_ties
 from colmap_affrect.mappers.surroundings import (
-    CLUMP,
+    CLUSTER_SIZE,
     Overlap,
     _Expected,
     _merged,
@@ -345,12 +345,12 @@ def test_what_one_pair_misses_others_find_and_beside_a_statue_none_does() -> Non
 
 
 def test_few_matches_that_come_together_leave_cells_empty() -> None:
-    """Of 64 cells 32 matches in 20 are as many as clumps let expect, and too few else."""
+    """Of 64 cells 32 matches in 20 are as many as clusters let expect, and too few else."""
     is_found = np.zeros(320, bool)
     is_found[:100:5] = True
     is_found[1:61:5] = True
     few = one_sees([is_found])
     apart_each = few.overlap_with(1, [2])
-    in_clumps = few.overlap_with(1, [2], CLUMP)
-    assert in_clumps.num_found == apart_each.num_found == 20.0
-    assert in_clumps.num_expected < apart_each.num_expected - 2.0
+    in_clusters = few.overlap_with(1, [2], CLUSTER_SIZE)
+    assert in_clusters.num_found == apart_each.num_found == 20.0
+    assert in_clusters.num_expected < apart_each.num_expected - 2.0
