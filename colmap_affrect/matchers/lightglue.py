@@ -276,8 +276,8 @@ def _attend_across(block: Any, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 def _by_head(descriptors: Tensor, num_heads: int) -> Tensor:
     """Return (B, N, D) descriptors as (B, H, N, D / H)."""
-    size, number, _ = descriptors.shape
-    parts = descriptors.reshape(size, number, num_heads, -1)
+    size, number, length = descriptors.shape
+    parts = descriptors.reshape(size, number, num_heads, length // num_heads)
     return parts.transpose(1, 2).contiguous()
 
 
