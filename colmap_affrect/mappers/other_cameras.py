@@ -9,7 +9,7 @@ al., Bayesian model averaging: a tutorial, 1999).
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,15 +63,36 @@ def pose_turns_deg(
     """
     before = poses_of(model)
     after = poses_of(changed)
-    both = sorted(before.keys() & after.keys())
-    changes_deg = defaultdict[int, list[float]](list)
-    for first, second in itertools.combinations(both, 2):
+
+    def change_deg(first: int, second: int) -> float:
         old = relative_pose(before[first], before[second])
         new = relative_pose(after[first], after[second])
-        change_deg = max(pose_errors(new, old))
-        changes_deg[first].append(change_deg)
-        changes_deg[second].append(change_deg)
+        return max(pose_errors(new, old))
+
+    return median_changes(model, before.keys() & after.keys(), change_deg)
+
+
+def median_changes(
+    model: pycolmap.Reconstruction,
+    image_ids: Collection[int],
+    change: Callable[[int, int], float],
+) -> dict[str, float]:
+    """Return the median of what changes between an image and each of the others.
+
+    Args:
+        model: Has the images.
+        image_ids: Of the images.
+        change: Of two images, in either order the same.
+
+    Returns:
+        By image name; nothing of an image alone.
+    """
+    changes = defaultdict[int, list[float]](list)
+    for first, second in itertools.combinations(sorted(image_ids), 2):
+        of_both = change(first, second)
+        changes[first].append(of_both)
+        changes[second].append(of_both)
     found = dict[str, float]()
-    for image_id, of_image in changes_deg.items():
+    for image_id, of_image in changes.items():
         found[model.images[image_id].name] = float(np.median(of_image))
     return found

@@ -12,8 +12,6 @@ from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers.adjustment import MEDIUM
@@ -26,6 +24,7 @@ from colmap_affrect.mappers.camera_priors import (
 )
 from colmap_affrect.mappers.distortion import straighten
 from colmap_affrect.mappers.focal_observability import with_fewer_points
+from colmap_affrect.mappers.other_cameras import median_changes
 from colmap_affrect.mappers.pair_graph import PairGraph, used_cameras
 from colmap_affrect.mappers.search import Search
 
@@ -200,19 +199,13 @@ def median_turns_deg(
     """
     before = _rotations(model)
     after = _rotations(changed)
-    both = sorted(before.keys() & after.keys())
-    found = dict[str, float]()
-    for image_id in both:
-        turns_deg = []
-        for other in both:
-            if other == image_id:
-                continue
-            old = before[other] * before[image_id].inverse()
-            new = after[other] * after[image_id].inverse()
-            turns_deg.append(math.degrees((new * old.inverse()).angle()))
-        if turns_deg:
-            found[model.images[image_id].name] = float(np.median(turns_deg))
-    return found
+
+    def turn_deg(first: int, second: int) -> float:
+        old = before[second] * before[first].inverse()
+        new = after[second] * after[first].inverse()
+        return math.degrees((new * old.inverse()).angle())
+
+    return median_changes(model, before.keys() & after.keys(), turn_deg)
 
 
 def _rotations(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rotation3d]:

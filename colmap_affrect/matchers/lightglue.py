@@ -231,7 +231,7 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
-def fuse_cross_attention(network: nn.Module) -> None:
+def fuse_cross_attention(network: Any) -> None:
     """Have LightGlue attend from image to image by torch's fused attention, on a CPU, too.
 
     kornia does so on GPUs alone. Elsewhere it holds the similarities of all pairs of features, for
@@ -240,7 +240,7 @@ def fuse_cross_attention(network: nn.Module) -> None:
     Args:
         network: kornia's; changed in place, where its blocks have the parts that are known.
     """
-    for layer in network.transformers:  # type: ignore[union-attr]
+    for layer in network.transformers:
         block = layer.cross_attn
         if all(hasattr(block, part) for part in CROSS_BLOCK_PARTS):
             block.forward = partial(_attend_across, block)

@@ -461,7 +461,12 @@ class ReconstructionReport(Summarized):
         for advice in self.advice[:MAX_ADVICE]:
             texts = filter(None, (advice.why, advice.command))
             lines.append("try         " + "\n            ".join(texts))
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._last_lines(said)])
+
+    def _last_lines(self, said: Callable[[Words], str]) -> list[str]:
+        """Return what reports that know more end with; ``said`` as for :meth:`summary`."""
+        del said  # this one knows no more
+        return []
 
     def stage_warnings(self, said: Callable[[Words], str]) -> dict[str, str]:
         """Return what stages warned of, by what it is about."""

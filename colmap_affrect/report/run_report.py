@@ -16,7 +16,6 @@ from colmap_affrect.errors import (
     Words,
     shown,
     such_as,
-    with_arguments,
 )
 from colmap_affrect.geometry.lines import LineCamera, LineFindings
 from colmap_affrect.mappers.camera_priors import (
@@ -88,22 +87,11 @@ class RunReport(ReconstructionReport):
         del content["output_path"]  # a folder may be moved
         return content
 
-    def summary(
-        self,
-        *,
-        with_warnings: bool = True,
-        said: Callable[[Words], str] = with_arguments,
-    ) -> str:
-        """Return one screen of text.
-
-        Args:
-            with_warnings: whether it has what stages warned of, which they have logged.
-            said: what options are called: :func:`with_arguments`, or :func:`with_flags`.
-        """
-        lines = [super().summary(with_warnings=with_warnings, said=said)]
-        for one in self.focal_contradictions[:MAX_LINES]:
-            lines.append(f"lines       {said(contradiction_words(one))}")
-        return "\n".join(lines)
+    def _last_lines(self, said: Callable[[Words], str]) -> list[str]:
+        contradictions = self.focal_contradictions[:MAX_LINES]
+        return [
+            f"lines       {said(contradiction_words(one))}" for one in contradictions
+        ]
 
     def __repr__(self) -> str:
         registered = f"{len(self.registered_names)} of {self.images_total} images"

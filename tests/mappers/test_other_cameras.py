@@ -53,6 +53,12 @@ def enlarged(path: Path, truth: pycolmap.Reconstruction) -> pycolmap.Image:
     return image
 
 
+def with_an_enlarged_image(folder: Path) -> tuple[MappingTask, pycolmap.Image]:
+    path = folder / "database.db"
+    truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
+    return task_of(path, truth), enlarged(path, truth)
+
+
 def test_log_odds_of_any_size_are_a_probability() -> None:
     turns_deg = {"a.jpg": 7.0}
     for log_odds, probability in ((-math.inf, 0.0), (0.0, 0.5), (2.0, 0.881), (1e6, 1)):
@@ -94,13 +100,9 @@ def test_photographs_of_one_camera_stay_where_they_are_with_own_ones(
 def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        hypotheses, "MIN_SCORE_GAIN", 1e9
-    )  # so that cameras stay shared
-    path = tmp_path / "database.db"
-    truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
-    task = task_of(path, truth)
-    image = enlarged(path, truth)
+    # So that cameras stay shared
+    monkeypatch.setattr(hypotheses, "MIN_SCORE_GAIN", 1e9)
+    task, image = with_an_enlarged_image(tmp_path)
     found = mapped(task, tmp_path)
     assert found.other_cameras is not None
     assert found.other_cameras.log_odds > 3.0
@@ -116,10 +118,7 @@ def test_an_enlarged_photograph_stands_elsewhere_with_a_camera_of_its_own(
 def test_that_cameras_may_be_shared_is_kept_by_models_that_go_on(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "database.db"
-    truth = synthesize(path, num_rigs=3, num_points3D=60, noise_px=0.5)
-    task = task_of(path, truth)
-    image = enlarged(path, truth)
+    task, image = with_an_enlarged_image(tmp_path)
     found = mapped(task, tmp_path)
     assert found.other_cameras is not None
     assert found.other_cameras.are_shared

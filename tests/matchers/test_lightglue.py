@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -178,7 +177,7 @@ def test_fused_attention_tells_each_image_what_kornia_tells_it(count: int) -> No
     second = torch.randn(1, count, 64)
     expected = block(first, second)
     network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
-    fuse_cross_attention(cast(torch.nn.Module, network))
+    fuse_cross_attention(network)
     fused = block(first, second)
     assert block.forward is not type(block).forward
     for found, known in zip(fused, expected, strict=True):
@@ -189,7 +188,7 @@ def test_fused_attention_tells_each_image_what_kornia_tells_it(count: int) -> No
 def test_another_network_of_kornia_stays_as_it_is() -> None:
     block = torch.nn.Linear(3, 3)
     network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
-    fuse_cross_attention(cast(torch.nn.Module, network))
+    fuse_cross_attention(network)
     assert "forward" not in vars(block)
 
 

@@ -248,9 +248,9 @@ def page_with_files(
     return page
 
 
+@pytest.mark.usefixtures("page_with_files")
 def test_pairs_that_are_not_in_the_page_are_read_from_files_beside_it(
     running: Browser,
-    page_with_files: Path,  # noqa: ARG001 (it is open)
 ) -> None:
     """A page on a disk may read no file but by a script; each is loaded once, by a click."""
     loaded = """return [...document.querySelectorAll("script[src]")]
