@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,8 +28,17 @@ from colmap_affrect.project.image_failures import (
     failures_to_mapping,
 )
 from colmap_affrect.project.line_report import LineReport, line_report
-from colmap_affrect.project.outputs import fitting_name, new_results
-from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.outputs import (
+    fitting_name,
+    new_results,
+    refuse_taken_places,
+)
+from colmap_affrect.project.paths import (
+    PathLike,
+    as_path,
+    as_path_or_none,
+    resolved,
+)
 from colmap_affrect.report.sheets import Color, Panel, encode_png, rgb, row_of, text_row
 
 logger = logging.getLogger(__name__)
@@ -124,17 +134,23 @@ def report_lines(
     Args:
         paths: of the photographs.
         output_path: folder for a picture of the lines of each photograph; None: none are drawn.
+            Where two photographs have one name, pictures stand in the folders of their photographs.
 
     Returns:
         What the lines say, and why photographs cannot be read.
 
     Raises:
-        OptionError: a picture is there already.
+        OptionError: a picture is there already, or would lie among the photographs; nothing
+            is measured then.
         WorkspaceError: a picture cannot be written.
     """
     folder = as_path_or_none(output_path, "output_path")
+    photographs = list(dict.fromkeys(as_path(given, "paths") for given in paths))
+    pictures = {} if folder is None else _picture_paths(photographs, folder)
+    for path, picture in pictures.items():
+        refuse_taken_places(picture, names=[path.name])
     found = LineReports()
-    for path in dict.fromkeys(as_path(given, "paths") for given in paths):
+    for path in photographs:
         try:
             gray = read_gray(path)
         except ImageError as error:
@@ -144,12 +160,29 @@ def report_lines(
         lines = lines_of(gray)
         report = line_report(lines.findings(), (gray.shape[1], gray.shape[0]))
         found.photographs[str(path)] = report
-        if folder is not None:
-            picture = folder / fitting_name(path.name, "-lines.png")
+        if path in pictures:
+            picture = pictures[path]
             with new_results(picture, names=[path.name]) as (new_picture,):
                 new_picture.write_bytes(line_sheet(gray, lines, report))
             found.pictures[str(path)] = picture
     return found
+
+
+def _picture_paths(photographs: Sequence[Path], folder: Path) -> dict[Path, Path]:
+    """Return where the lines of each photograph are drawn: in one folder, if names differ."""
+    parents = [resolved(path.parent) for path in photographs]
+    names = {path.name for path in photographs}
+    is_flat = len(names) == len(photographs)
+    found = {}
+    for path, parent in zip(photographs, parents, strict=True):
+        inner = Path() if is_flat else _below_common(parent, parents)
+        found[path] = folder / inner / fitting_name(path.name, "-lines.png")
+    return found
+
+
+def _below_common(parent: Path, parents: Sequence[Path]) -> Path:
+    """Return a folder as seen from the one that all of these are in."""
+    return parent.relative_to(os.path.commonpath(parents))
 
 
 def read_gray(path: Path) -> GrayImage:
