@@ -17,10 +17,11 @@ from colmap_affrect.errors import ImageError, OptionError, shown
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.conventions import HALF_PIXEL
-from colmap_affrect.geometry.lines import Explanation, Lines
+from colmap_affrect.geometry.lines import DOWN, Explanation, Lines
 from colmap_affrect.geometry.vanishing import CHANCE
 from colmap_affrect.images import reading
 from colmap_affrect.images.lines import lines_of
+from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.image_failures import (
     ImageFailure,
@@ -113,16 +114,18 @@ def camera_from_lines(
         ImageError: the photograph cannot be read.
         OptionError: the array is no photograph, or the mask has another size.
     """
-    gray = (
-        _gray_values(image)
-        if isinstance(image, np.ndarray)
-        else read_gray(as_path(image))
-    )
+    down = DOWN
+    if isinstance(image, np.ndarray):
+        gray = _gray_values(image)
+    else:
+        path = as_path(image)
+        gray = read_gray(path)
+        down = picture_down(path)
     if mask is not None and mask.shape != gray.shape:
         raise OptionError(
             f"has the shape {mask.shape}, and the photograph {gray.shape}", where="mask"
         )
-    found = lines_of(gray, mask).findings()
+    found = lines_of(gray, mask, down).findings()
     return line_report(found, (gray.shape[1], gray.shape[0]))
 
 
@@ -157,7 +160,7 @@ def report_lines(
             logger.warning("%s", error)
             found.failed[str(path)] = failure_of(error)
             continue
-        lines = lines_of(gray)
+        lines = lines_of(gray, down=picture_down(path))
         report = line_report(lines.findings(), (gray.shape[1], gray.shape[0]))
         found.photographs[str(path)] = report
         if path in pictures:

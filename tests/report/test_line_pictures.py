@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from line_scenes import SIZE, Building
+from PIL import ExifTags, Image
 from synthetic import write_image
 
 from colmap_affrect.data import GrayImage
@@ -134,3 +135,19 @@ def test_a_place_that_is_taken_is_refused_before_anything_is_drawn(
     with pytest.raises(OptionError, match="lies in the folder of the photographs"):
         report_lines(paths, tmp_path / "b" / "out")
     assert not (tmp_path / "b" / "out").exists()
+
+
+def test_a_photograph_that_is_stored_on_its_side_has_the_upright_of_its_picture(
+    tmp_path: Path, drawing: GrayImage
+) -> None:
+    upright = camera_from_lines(write_image(tmp_path / "a.png", drawing)).up
+    assert upright is not None
+    right, down, ahead = upright
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # the camera was turned to the right
+    path = tmp_path / "b.png"
+    Image.fromarray(np.rot90(drawing)).save(path, exif=exif)
+    found = camera_from_lines(path).up
+    assert found == pytest.approx((down, -right, ahead), abs=0.03)
+    reports = report_lines([path])
+    assert reports.photographs[str(path)].up == found
