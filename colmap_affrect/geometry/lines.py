@@ -89,6 +89,7 @@ class LineCamera:
         shift_sigma: its deviation.
         rotation: (3, 3), rows are the three directions in the camera's frame, for the likeliest.
         up: (3,) the direction of these that is nearest to the upright of the picture, upwards.
+        up_sigma: its deviation in radians, over all focal lengths and shifts.
     """
 
     focal: float
@@ -97,6 +98,7 @@ class LineCamera:
     shift_sigma: float
     rotation: Floats
     up: Floats
+    up_sigma: float
 
     @property
     def is_known(self) -> bool:
@@ -255,14 +257,42 @@ def line_camera(
     shift = float(of_shifts @ SHIFTS)
     shift_variance = float(of_shifts @ (SHIFTS - shift) ** 2)
     rotation = likelihood.rotations[_likeliest(chances)]
+    up = upright_of(rotation, down)
     return LineCamera(
         focal=math.exp(log_focal),
         focal_sigma=math.hypot(math.sqrt(focal_variance), MODEL_SIGMA),
         shift=shift,
         shift_sigma=math.sqrt(shift_variance),
         rotation=rotation,
-        up=upright_of(rotation, down),
+        up=up,
+        up_sigma=_up_sigma(likelihood, chances, up, down),
     )
+
+
+def _up_sigma(
+    likelihood: LineLikelihood,
+    chances: Floats,
+    up: Floats,
+    down: tuple[float, float],
+) -> float:
+    """Return how far the uprights of all focal lengths and shifts are from one, in radians.
+
+    Lines of buildings have much the same upright whatever the focal length, leaves and faces
+    another one for each.
+
+    Args:
+        likelihood: of the lines.
+        chances: (F, S) probabilities of focal lengths and shifts.
+        up: (3,) the likeliest upright.
+        down: downwards in the picture, right and down in the image as stored.
+    """
+    downwards = likelihood.rotations[..., :2] @ np.array(down)
+    nearest = np.abs(downwards).argmax(axis=2)[..., None]
+    rows = np.take_along_axis(likelihood.rotations, nearest[..., None], axis=2)
+    signs = np.where(np.take_along_axis(downwards, nearest, axis=2) < 0.0, 1.0, -1.0)
+    ups = signs * rows[:, :, 0]
+    angles = np.arccos(np.clip(ups @ up, -1.0, 1.0))
+    return math.sqrt(float(np.sum(chances * angles**2)))
 
 
 def shift_evidence(likelihood: LineLikelihood) -> float:

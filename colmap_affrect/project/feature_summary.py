@@ -30,8 +30,8 @@ class ImageSummary(NamedTuple):
 class _LineRow(NamedTuple):
     num_segments: int
     says_shifted: bool
-    # Focal length, shift, each followed by its deviation, nine numbers of the rotation, and three
-    # of the upright; or none
+    # Focal length, shift, each followed by its deviation, nine numbers of the rotation, three of
+    # the upright and its deviation; or none
     camera: list[float]
 
 
@@ -50,7 +50,7 @@ class _Table:
 
 
 TABLE_JSON = TypeAdapter(_Table)
-NUM_CAMERA_VALUES = 16  # format
+NUM_CAMERA_VALUES = 17  # format
 # Counts up when the same features give other summaries, as by other priors of lines; format
 FORMAT_VERSION = 2
 
@@ -119,7 +119,7 @@ def _line_row(found: LineFindings) -> _LineRow:
     if camera:
         values = [camera.focal, camera.focal_sigma, camera.shift, camera.shift_sigma]
         values += camera.rotation.ravel().tolist()
-        values += camera.up.tolist()
+        values += [*camera.up.tolist(), camera.up_sigma]
     return _LineRow(found.num_segments, found.says_shifted, values)
 
 
@@ -137,6 +137,7 @@ def _findings_of(row: _LineRow) -> LineFindings:
         shift=shift,
         shift_sigma=shift_sigma,
         rotation=rotation,
-        up=np.array(values[9:]),
+        up=np.array(values[9:12]),
+        up_sigma=values[12],
     )
     return LineFindings(row.num_segments, camera, row.says_shifted)

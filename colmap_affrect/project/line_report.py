@@ -1,5 +1,6 @@
 """What is stored and reported of the straight lines of a photograph."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -53,6 +54,8 @@ class LineReport:
     """Whether the lines say that the optical axis is not in the middle."""
     up: tuple[float, float, float] | None = None
     """The upright direction in the frame of the camera: x right, y down, z ahead."""
+    up_sigma_deg: float | None = None
+    """Its deviation; one of more than a few degrees is by chance."""
 
     def sentence(self) -> str:
         """Return what the lines say in a sentence."""
@@ -97,6 +100,7 @@ def line_report(found: LineFindings, image_size: tuple[int, int]) -> LineReport:
         shift_sigma_px=camera.shift_sigma * longer_side,
         is_shifted=found.says_shifted,
         up=(x, y, z),
+        up_sigma_deg=math.degrees(camera.up_sigma),
     )
 
 
