@@ -18,16 +18,21 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.reliability import (
+    MAX_ERROR_DEG,
     NUM_REASONS,
     Confidence,
     score_images,
     share_within_limit,
 )
+from colmap_affrect.mappers.small_motions import small_motion
 from colmap_affrect.mappers.surer_apart import surer_apart
 from colmap_affrect.mappers.surroundings import apart, known_places
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, PrincipalPointContradiction
 
+# Of the angle between poses by what moves and by the rest; judged
+CHANGE_SIGMA_DEG = 1.5
+NEGLIGIBLE = 0.01  # chance of wrong poses by a small motion, which is not told; judged
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
 (theory)."""
@@ -102,6 +107,18 @@ def _doubt_motion(model: ScoredModel, task: MappingTask) -> None:
         doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})
         for name in list(model.confidences):
             _doubt(model, name, share, doubt)
+        return
+    small = small_motion(model.mapped.reconstruction)
+    if small is None or not small.changes_deg:
+        return
+    # A model follows one of both as a whole: where they are farthest apart they are told best.
+    farther = (max(small.changes_deg.values()) - MAX_ERROR_DEG) / CHANGE_SIGMA_DEG
+    off = 0.5 * math.erfc(-farther / math.sqrt(2.0))  # where the rest is the scene
+    wrong = (1.0 - small.share) * off
+    if wrong > NEGLIGIBLE:
+        doubt = Doubt("something_moves", {"percent": math.floor(100.0 * small.share)})
+        for name in list(model.confidences):
+            _doubt(model, name, 1.0 - wrong, doubt)
 
 
 def _doubt_given_principal_points(scored: ScoredModel, task: MappingTask) -> None:
