@@ -194,7 +194,7 @@ class HypothesisTest:
         are.
         """
         search = self.search
-        if not self.best or search.graph.has_rigs:
+        if not self.best or search.graph.has_rigs or self._take_own_shifted_axes():
             return
         free = with_free_principal_points(search, self.task.cameras)
         model = self.best[0].reconstruction
@@ -209,6 +209,33 @@ class HypothesisTest:
                 replace(self.best[0], axis_turns_deg=turns_deg),
                 *self.best[1:],
             ]
+
+    def _take_own_shifted_axes(self) -> bool:
+        """Free the principal points of images that seem to share cameras; tell whether it is done.
+
+        Prints of one size that were cut from photographs in different places share no camera: with
+        axes in the middle own ones bring little, and shared ones have no axis to free.
+        """
+        own = self.per_image
+        model = self.best[0].reconstruction
+        if own is None or model.num_reg_images() > MAX_OPEN_IMAGES:
+            return False
+        free = with_free_principal_points(own, self.task.cameras)
+        if free is None:
+            return False
+        apart = own.grower(own.graph).remake(model)
+        if not gains_of_freedom(apart, own, free).contradict_constant:
+            return False
+        shared = self.search, self.best
+        self.search = own
+        first = replace(self.best[0], reconstruction=apart)
+        others = [_remade(own, mapped) for mapped in self.best[1:]]
+        self.best = [first.also_by(PER_IMAGE_CAMERAS), *others]
+        if self._take_shifted_axes(free):
+            self.per_image = None
+            return True
+        self.search, self.best = shared
+        return False
 
     def _take_shifted_axes(self, free: Search) -> bool:
         """Take the best model with free principal points where it scores higher; tell whether."""
