@@ -156,10 +156,10 @@ class Search:
         """
         if not models:
             return []
-        if not self.builds_bridges or not graph.unexplained_by(
-            models[0].reconstruction
-        ):
+        if not graph.unexplained_by(models[0].reconstruction):
             return [models[0]]
+        if not self.builds_bridges:
+            return with_new_images(models)
         grower = self.grower(graph)
         bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
         joined = list[MappedModel]()
