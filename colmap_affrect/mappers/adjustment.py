@@ -355,7 +355,8 @@ class Adjuster:
         for _, image_id, observed in self.tie_points.observed(model):
             blocks = _pose_and_camera(model, image_id)
             if blocks and all(map(problem.has_parameter_block, blocks)):
-                mark = _Mark(observed.xy, model.images[image_id].camera.model, blocks)
+                camera = model.cameras[model.images[image_id].camera_id]
+                mark = _Mark(observed.xy, camera.model, blocks)
                 marks_of[observed.point3D_id].append(mark)
         for point_id, marks in marks_of.items():
             point = model.points3D[point_id]
