@@ -43,7 +43,7 @@ from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.extract import extract_images
-from colmap_affrect.stages.match import matched_at_level, num_confirming, write_batches
+from colmap_affrect.stages.match import matched_at_level, num_consistent, write_batches
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.verify import update_verified
 
@@ -468,7 +468,7 @@ class Escalation:
         num_inliers = len(verifier.inliers(found.names, frames, found.indices))
         if num_inliers:
             return num_inliers, 0
-        return 0, num_confirming(features, found.names, found.indices)
+        return 0, num_consistent(features, found.names, found.indices)
 
     def _keep(self, batch: Sequence[Trial], level: int) -> None:
         """Write the better matches of some trials, and that all were made; all or nothing."""

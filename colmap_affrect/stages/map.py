@@ -130,7 +130,7 @@ def _make_mapped_database(
     """Make the database that is mapped, a copy where somebody has changed something by hand.
 
     Returns:
-        Its path, and the keypoints of tie points: indices by image and point.
+        Its path, and the keypoints of tie points: indices by point and image name.
     """
     workspace = context.workspace
     by_hand = context.by_hand

@@ -241,7 +241,7 @@ def test_a_pair_is_worth_its_inliers_or_else_its_consistent_matches(
 ) -> None:
     context = context_in(tmp_path)
     context.features.read_frames = lambda name: name
-    monkeypatch.setattr(escalate, "num_confirming", lambda *_: 6)
+    monkeypatch.setattr(escalate, "num_consistent", lambda *_: 6)
     verifier: Any = SimpleNamespace(inliers=lambda *_: [(0, 1)] * num_inliers)
     escalation = escalation_of(context)
     assert escalation._worth(matches_of("a", "b", 1), verifier) == worth

@@ -29,7 +29,7 @@ from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.other_motions import (
     _Motions,
     _motions_of_pair,
-    share_of_motion,
+    share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary
@@ -101,7 +101,7 @@ def scene(
 
 def share(path: Path, left_of: float, *, repeats: bool = False) -> float:
     model = scene(path, left_of, repeats=repeats)
-    return share_of_motion(model, PairGraph.read(path))
+    return share_moving_as_modelled(model, PairGraph.read(path))
 
 
 def left_part_of_wall(part: float) -> float:
@@ -153,7 +153,7 @@ def test_model_beside_which_as_much_moves_is_not_sure_and_says_so(
 
 def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None:
     path = tmp_path / "still.db"
-    mapped = MappedModel(scene(path, -np.inf), motion_share=0.4)
+    mapped = MappedModel(scene(path, -np.inf), share_as_modelled=0.4)
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE

@@ -378,7 +378,7 @@ class RisingSearch(Search):
         assert self.model is not None
         self.built_bridges.append(search.builds_bridges)
         found = [MappedModel(pycolmap.Reconstruction(self.model))]
-        return _Attempt(found, float(len(self.built_bridges)), agrees=True)
+        return _Attempt(found, float(len(self.built_bridges)), focals_agree=True)
 
 
 def without_last(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
