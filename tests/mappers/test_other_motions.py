@@ -25,7 +25,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import Side
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import map_database, read_models
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import (
     _Motions,
     _motions_of_pair,
@@ -157,6 +158,22 @@ def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE
+
+
+@pytest.mark.parametrize("are_shared", [True, False])
+def test_models_that_are_gone_on_from_bring_what_is_not_looked_at_again(
+    tmp_path: Path, *, are_shared: bool
+) -> None:
+    """Own cameras of shared ones are; what cameras hide that were freed, and one camera are not."""
+    path = tmp_path / "still.db"
+    other = OtherCameras(-1.0, {"1.jpg": 3.0}, are_shared=are_shared)
+    summary(
+        path,
+        MappedModel(scene(path, -np.inf), other_cameras=other, share_as_modelled=0.4),
+    )
+    (found,) = read_models(tmp_path / "sparse")
+    assert found.share_as_modelled == 0.4
+    assert found.other_cameras == (other if are_shared else None)
 
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 900.0, 800, 600)
