@@ -258,11 +258,13 @@ class StepPlanner:
         1 / (n + 1), about. While there is no model, each pair of images to match again may begin
         one, and so may other matches of a pair that a wrong model stood on.
         """
-        first = self._component_of[pair[0]]
-        second = self._component_of[pair[1]]
-        if first != second:
-            return self._joined_component(max(first, second))  # the smaller one
-        if first and self.registered and not self.states[pair].is_questioned:
+        component = self._component_of[pair[0]]
+        other = self._component_of[pair[1]]
+        if component != other:
+            return self._joined_component(max(component, other))  # the smaller one
+        is_of_largest = component == 0
+        may_begin = not self.registered or self.states[pair].is_questioned
+        if not (is_of_largest or may_begin):
             return []
         connections = list[Connection]()
         for name in pair:
