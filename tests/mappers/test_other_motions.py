@@ -25,11 +25,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import Side
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import map_database, read_models
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import (
     _Motions,
     _motions_of_pair,
-    share_of_motion,
+    share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary
@@ -101,7 +102,7 @@ def scene(
 
 def share(path: Path, left_of: float, *, repeats: bool = False) -> float:
     model = scene(path, left_of, repeats=repeats)
-    return share_of_motion(model, PairGraph.read(path))
+    return share_moving_as_modelled(model, PairGraph.read(path))
 
 
 def left_part_of_wall(part: float) -> float:
@@ -153,10 +154,26 @@ def test_model_beside_which_as_much_moves_is_not_sure_and_says_so(
 
 def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None:
     path = tmp_path / "still.db"
-    mapped = MappedModel(scene(path, -np.inf), motion_share=0.4)
+    mapped = MappedModel(scene(path, -np.inf), share_as_modelled=0.4)
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE
+
+
+@pytest.mark.parametrize("are_shared", [True, False])
+def test_models_that_are_gone_on_from_bring_what_is_not_looked_at_again(
+    tmp_path: Path, *, are_shared: bool
+) -> None:
+    """Own cameras of shared ones are; what cameras hide that were freed, and one camera are not."""
+    path = tmp_path / "still.db"
+    other = OtherCameras(-1.0, {"1.jpg": 3.0}, are_shared=are_shared)
+    summary(
+        path,
+        MappedModel(scene(path, -np.inf), other_cameras=other, share_as_modelled=0.4),
+    )
+    (found,) = read_models(tmp_path / "sparse")
+    assert found.share_as_modelled == 0.4
+    assert found.other_cameras == (other if are_shared else None)
 
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 900.0, 800, 600)
