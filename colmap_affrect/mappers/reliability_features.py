@@ -113,7 +113,10 @@ class _ModelContext:
         self.cameras = cameras_of(self.model)
         self.used_cameras = used_cameras(self.model)
         used = self.used_cameras.values()
-        priors = camera_priors(used, task.cameras, task.lines)
+        # Those of the model have moved from the focal lengths that EXIF says.
+        before = {camera.camera_id: camera for camera in self.graph.cameras.values()}
+        known = [before.get(camera.camera_id, camera) for camera in used]
+        priors = camera_priors(known, task.cameras, task.lines)
         self.priors = with_distortion_of(priors, used)
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)
