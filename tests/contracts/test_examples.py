@@ -18,6 +18,7 @@ from contracts.contracts import (
     RectifierContract,
 )
 from contracts.mapper_contract import MapperContract
+from deciding_numbers import Module, all_numbers, faults
 from small_comparison import make_comparison
 from small_scene import NAMES
 from synthetic import texture, write_image
@@ -26,7 +27,7 @@ from colmap_affrect.comparison import results, tables
 from colmap_affrect.errors import OptionError
 from colmap_affrect.escalation.expected_gain import kind_of
 from colmap_affrect.features.base import EXTRACTORS, FeatureExtractor, NetworkContext
-from colmap_affrect.mappers.base import MAPPERS, MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
@@ -107,14 +108,6 @@ class TestPlain(MapperContract):
     def options(self) -> MapperOptions:
         return MAPPERS.options("plain")
 
-    @pytest.mark.xfail(
-        strict=True, reason="the example does not pass ignore_two_view_tracks on"
-    )
-    def test_mapper_finds_poses_and_points_also_of_two_views(
-        self, task: MappingTask, tmp_path: Path
-    ) -> None:
-        super().test_mapper_finds_poses_and_points_also_of_two_views(task, tmp_path)
-
 
 def test_new_rectifier_is_escalated_to_as_what_it_declares_to_be() -> None:
     recipe = load_recipe("default", ["rectifier=along-street", "rectifier.tilt=2.5"])
@@ -146,6 +139,17 @@ def test_example_passes_lint_where_it_is_to_be(name: str, check: str) -> None:
         command, input=code, cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_numbers_of_an_example_may_be_added_to_those_of_the_package(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = all_numbers()
+    monkeypatch.setattr("deciding_numbers.ROOT", tmp_path)
+    path = tmp_path / "example.py"
+    path.write_text(example(name)[1], encoding="utf-8")
+    assert faults([*known, *Module(path).numbers()]) == []
 
 
 @needs("mypy")
