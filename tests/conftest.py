@@ -23,6 +23,9 @@ from small_scene import write_photographs
 from colmap_affrect.cli import main
 from colmap_affrect.errors import AffrectError, with_flags
 
+# So that pytest says what a check of a contract has found, as it does of tests.
+pytest.register_assert_rewrite("contracts.contracts", "contracts.mapper_contract")
+
 settings.register_profile(
     "ci",
     derandomize=True,

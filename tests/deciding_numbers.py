@@ -194,8 +194,27 @@ def all_numbers() -> list[Number]:
     return found
 
 
+def faults(found: Sequence[Number]) -> list[str]:
+    """Return what is wrong with numbers, and what to do."""
+    words = ", ".join(SOURCES)
+    texts = []
+    for number in found:
+        if not number.source:
+            texts.append(
+                f"{number.where}: {number.name} = {number.value} does not say where it is from: "
+                f"its comment, or the text below it, needs one of the words {words}"
+            )
+    judged = sum(number.source == JUDGED for number in found)
+    if judged > MAX_JUDGED:
+        texts.append(
+            f"{judged} numbers are judged, at most {MAX_JUDGED} may be: give a new one another "
+            "source, such as theory or a measurement, or do without it or another one"
+        )
+    return texts
+
+
 def main() -> int:
-    """Print the numbers, and what is wrong with them."""
+    """Print the numbers, and at the end what is wrong with them."""
     found = all_numbers()
     counts = Counter(number.source or "no source" for number in found)
     for number in found:
@@ -205,7 +224,10 @@ def main() -> int:
     without = counts["no source"]
     judged = counts[JUDGED]
     print(f"{judged} judged (at most {MAX_JUDGED}), {without} without a source (none)")
-    return int(bool(without) or judged > MAX_JUDGED)
+    wrong = faults(found)
+    for text in wrong:
+        print(text)
+    return int(bool(wrong))
 
 
 if __name__ == "__main__":

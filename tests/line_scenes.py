@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from strategies import Array
+
+from colmap_affrect.data import GrayImage
 
 SIZE = (1500, 1000)  # of the images, px
 
@@ -79,3 +82,39 @@ def arch_edges(number: int) -> Array:
         )
         found.append(np.hstack([points[:-1], points[1:]]))
     return np.concatenate(found)
+
+
+WALL_FOCAL = 1.0  # longer sides
+WALL_TURN = turn(0, -8.0) @ turn(
+    1, 42.0
+)  # columns are right, down and ahead of the building
+
+
+def pixels(points: Array, rotation: Array = WALL_TURN) -> Array:
+    """(N, 2) pixel-centre px of (N, 3) points in the frame of the building, its corner at 0."""
+    in_camera = points @ rotation.T + [0.0, 0.0, 6.0]
+    return (
+        WALL_FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:]
+        + np.array(SIZE) / 2.0
+        - 0.5
+    )
+
+
+def draw_wall(image: GrayImage, along: Array, rotation: Array = WALL_TURN) -> None:
+    """Draw windows on a wall that runs from the corner along a direction."""
+    down = np.array([0.0, 1.0, 0.0])
+    for column in range(5):
+        for row in range(4):
+            start = along * (0.3 + 0.55 * column) + down * (0.6 * row - 1.2)
+            corners = [start, start + 0.35 * along, start + 0.35 * along + 0.4 * down,
+                       start + 0.4 * down]  # fmt: skip
+            outline = np.rint(pixels(np.array(corners), rotation)).astype(np.int32)
+            cv2.fillPoly(image, [outline], 40, cv2.LINE_AA)
+
+
+def corner_of_walls() -> GrayImage:
+    """Draw windows on two walls of a court that meet in the middle."""
+    image = np.full(SIZE[::-1], 200, np.uint8)
+    draw_wall(image, np.array([1.0, 0.0, 0.0]))
+    draw_wall(image, np.array([0.0, 0.0, -1.0]))
+    return image

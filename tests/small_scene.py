@@ -67,6 +67,12 @@ def photograph(
     return image
 
 
+def place_of(index: int) -> tuple[tuple[float, float, float], float]:
+    """Return the position and the yaw in degrees of one of the photographs."""
+    position = (0.55 * (index - 1.5), -0.1 * index, 0.1 * index)
+    return position, -5.0 * (index - 1.5)
+
+
 def write_photographs(
     folder: Path, count: int = len(NAMES), first_seed: int = 0
 ) -> list[str]:
@@ -74,6 +80,5 @@ def write_photographs(
     for index, name in enumerate(NAMES[:count]):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        position = (0.55 * (index - 1.5), -0.1 * index, 0.1 * index)
-        write_image(path, photograph(position, -5.0 * (index - 1.5), first_seed))
+        write_image(path, photograph(*place_of(index), first_seed))
     return NAMES[:count]

@@ -15,6 +15,7 @@ from deciding_numbers import (
     Module,
     Number,
     all_numbers,
+    faults,
 )
 from mutations import multiplied, mutations
 
@@ -66,13 +67,32 @@ def test_sources_are_read_beside_above_and_below_numbers(
     }
 
 
-def test_all_numbers_of_the_package_say_where_they_are_from() -> None:
-    assert [number.where for number in all_numbers() if not number.source] == []
+def test_all_numbers_of_the_package_say_where_they_are_from_and_no_more_are_judged() -> (
+    None
+):
+    assert faults(all_numbers()) == []
 
 
-def test_no_more_numbers_are_judged_than_before() -> None:
-    judged = [number for number in all_numbers() if number.source == JUDGED]
-    assert len(judged) <= MAX_JUDGED
+def test_a_number_without_a_source_is_named_with_the_words_for_one(
+    example: dict[str, Number],
+) -> None:
+    texts = faults(list(example.values()))
+    assert [text.partition(" = ")[0] for text in texts] == [
+        "example.py:4: PLAIN",
+        "example.py:21: SomeOptions.unknown",
+    ]
+    assert "needs one of the words judged, fitted, measured" in texts[0]
+
+
+def test_one_judged_number_too_many_is_told_with_what_to_do(
+    example: dict[str, Number],
+) -> None:
+    judged = [example["BESIDE"]]
+    assert faults(judged * MAX_JUDGED) == []
+    assert faults(judged * (MAX_JUDGED + 1)) == [
+        f"{MAX_JUDGED + 1} numbers are judged, at most {MAX_JUDGED} may be: give a new one "
+        "another source, such as theory or a measurement, or do without it or another one"
+    ]
 
 
 def test_files_of_fitted_numbers_say_when_and_from_what_they_were_made() -> None:

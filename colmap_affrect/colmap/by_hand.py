@@ -339,4 +339,8 @@ def triangulated(
     rays = np.column_stack([np.array(flat).reshape(-1, 2), np.ones(len(flat))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     point = pycolmap.triangulate_multi_view_point(poses, rays)
-    return None if point is None else np.asarray(point).ravel()
+    if point is None:
+        return None
+    position: Array = np.asarray(point, np.float64).ravel()
+    depths = [pose[2, :3] @ position + pose[2, 3] for pose in poses]
+    return position if min(depths) > 0.0 else None

@@ -423,15 +423,16 @@ def _is_pose(pose: pycolmap.Rigid3d) -> bool:
 
 
 def num_long_tracks(
-    model: pycolmap.Reconstruction, same_view: Mapping[int, int]
+    model: pycolmap.Reconstruction, viewpoint_of: Mapping[int, int]
 ) -> Counter[int]:
     """Return how many points of three views or more each image sees, by its id.
 
-    ``same_view``: of images that show the view of another one, the id of that.
+    ``viewpoint_of``: of images from the same viewpoint, which count as one, a common number by
+    image id; others have none.
     """
     found = Counter[int]()
     for image_ids in _long_tracks(model):
-        views = {same_view.get(image_id, image_id) for image_id in image_ids}
+        views = {viewpoint_of.get(image_id, image_id) for image_id in image_ids}
         if len(views) > 2:
             found.update(image_ids)
     return found

@@ -43,7 +43,7 @@ from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.extract import extract_images
-from colmap_affrect.stages.match import matched_at_level, num_confirming, write_batches
+from colmap_affrect.stages.match import matched_at_level, num_consistent, write_batches
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 from colmap_affrect.stages.verify import update_verified
 
@@ -207,9 +207,9 @@ class Escalation:
         """Return the pairs of a step that has begun for which its level was not tried yet."""
         tried_levels = self.matches.levels(self.state.pairs, "tried")
         left = list[Pair]()
-        for pair in begun.pairs:
+        for pair in self._allowed(begun.pairs):
             was_tried = tried_levels.get(pair, -1) >> begun.level & 1
-            if not was_tried and self.context.by_hand.allows(*pair):
+            if not was_tried:
                 left.append(pair)
         return left
 
@@ -355,8 +355,9 @@ class Escalation:
             How many were matched; some may be left where the time that the user gave is over.
         """
         planned = self.matches.state.learned_matching or Begun(0, ())
-        done = self.matches.learned_levels(planned.pairs)
-        todo = [pair for pair in planned.pairs if done[pair] < 0]
+        pairs = self._allowed(planned.pairs)
+        done = self.matches.learned_levels(pairs)
+        todo = [pair for pair in pairs if done[pair] < 0]
         num_matched = 0
         for begin in range(0, len(todo), PAIRS_AT_ONCE):
             if self.is_over_time:
@@ -369,12 +370,15 @@ class Escalation:
 
     @property
     def has_all_learned_matches(self) -> bool:
-        """Whether all pairs of :meth:`plan_learned_matching` have learned matches."""
+        """Whether :meth:`plan_learned_matching` has pairs, and all have learned matches."""
         planned = self.matches.state.learned_matching
-        if planned is None:
-            return False
-        levels = self.matches.learned_levels(planned.pairs)
-        return min(levels.values()) >= 0
+        pairs = self._allowed(planned.pairs) if planned else []
+        levels = self.matches.learned_levels(pairs)
+        return min(levels.values(), default=-1) >= 0
+
+    def _allowed(self, pairs: Sequence[Pair]) -> list[Pair]:
+        """Return those of some pairs that nobody has rejected since they were planned."""
+        return [pair for pair in pairs if self.context.by_hand.allows(*pair)]
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""
@@ -464,7 +468,7 @@ class Escalation:
         num_inliers = len(verifier.inliers(found.names, frames, found.indices))
         if num_inliers:
             return num_inliers, 0
-        return 0, num_confirming(features, found.names, found.indices)
+        return 0, num_consistent(features, found.names, found.indices)
 
     def _keep(self, batch: Sequence[Trial], level: int) -> None:
         """Write the better matches of some trials, and that all were made; all or nothing."""

@@ -125,12 +125,12 @@ def terms(state: PairState, wins: int, losses: int) -> dict[str, float]:
     Returns:
         The value of each term of the regression, by name.
     """
-    num_levels_in_vain = (state.tried >> 1).bit_count()
+    num_levels_tried = (state.tried >> 1).bit_count()
     return {
         "constant": 1.0,
         "consistent": math.log1p(state.num_consistent),
         "inliers": math.log1p(state.num_inliers),
-        "tried": float(num_levels_in_vain),
+        "tried": float(num_levels_tried),
         "success_ratio": math.log((1 + wins) / (1 + losses)),
     }
 
@@ -258,11 +258,13 @@ class StepPlanner:
         1 / (n + 1), about. While there is no model, each pair of images to match again may begin
         one, and so may other matches of a pair that a wrong model stood on.
         """
-        first = self._component_of[pair[0]]
-        second = self._component_of[pair[1]]
-        if first != second:
-            return self._joined_component(max(first, second))  # the smaller one
-        if first and self.registered and not self.states[pair].is_questioned:
+        component = self._component_of[pair[0]]
+        other = self._component_of[pair[1]]
+        if component != other:
+            return self._joined_component(max(component, other))  # the smaller one
+        is_of_largest = component == 0
+        may_begin = not self.registered or self.states[pair].is_questioned
+        if not (is_of_largest or may_begin):
             return []
         connections = list[Connection]()
         for name in pair:
@@ -296,13 +298,15 @@ class StepPlanner:
         num_inliers, num_consistent = state.measured_worth
         return replace(state, num_inliers=num_inliers, num_consistent=num_consistent)
 
-    def candidates(self, number: int, level: Level, others: int) -> list[Candidate]:
+    def candidates(
+        self, number: int, level: Level, needless_after: int
+    ) -> list[Candidate]:
         """Return the pairs that a level may verify, the most promising one first.
 
         Args:
             number: of the level in the recipe.
             level: what is extracted and matched there.
-            others: bits of the levels that make this one needless where they were tried.
+            needless_after: bits of the levels that make this one needless where they were tried.
 
         Returns:
             Candidates by falling number of photographs that they are expected to save.
@@ -311,7 +315,7 @@ class StepPlanner:
         wins, losses = self._wins_and_losses(number)
         candidates = list[Candidate]()
         for pair, state in self.states.items():
-            if state.tried & others or self._is_strong(pair):
+            if state.tried & needless_after or self._is_strong(pair):
                 continue
             connections = self._connections(pair)
             if not connections:
@@ -334,7 +338,7 @@ class StepPlanner:
         return wins, max(0, num_tried - wins)
 
     def best_step(
-        self, number: int, level: Level, others: int, budget_s: float
+        self, number: int, level: Level, needless_after: int, budget_s: float
     ) -> Step:
         """Return the pairs to match at a level now.
 
@@ -344,7 +348,7 @@ class StepPlanner:
         Args:
             number: of the level in the recipe.
             level: what is extracted and matched there.
-            others: bits of the levels that make this one needless where they were tried.
+            needless_after: bits of the levels that make this one needless where they were tried.
             budget_s: seconds of one core that the pairs may take.
 
         Returns:
@@ -354,7 +358,7 @@ class StepPlanner:
         statistics = statistics_of(level)
         now = _Selection(self, statistics, seconds=mapping_s)
         affordable = _Selection(self, statistics, seconds=mapping_s)
-        for one in self.candidates(number, level, others):
+        for one in self.candidates(number, level, needless_after):
             if affordable.seconds + affordable.seconds_of(one) - mapping_s > budget_s:
                 continue
             affordable.add(one)

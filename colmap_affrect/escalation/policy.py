@@ -232,7 +232,7 @@ class Situation:
         return self.planner(number, weights).best_step(
             number=number,
             level=self.levels[number],
-            others=self.needless_after(number),
+            needless_after=self.needless_after(number),
             budget_s=budget_s,
         )
 

@@ -14,10 +14,10 @@ from colmap_affrect.mappers.sparse import MIN_LARGE_SET
 from colmap_affrect.mappers.wrong_models import read_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Size
-from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.report import NO_MODEL, ModelSummary
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
-from colmap_affrect.stages.match import num_confirming
+from colmap_affrect.stages.match import num_consistent
 
 # Share of its gain that an image weighs that is likely right already: matches mend few of these;
 # judged on the sets of tests/benchmarks/effort.py
@@ -43,7 +43,7 @@ class SetState:
             level.features.has_shapes for level in context.extraction.levels
         ]
         # Raw matches of pairs, and how many of them confirm each other
-        self._confirming = dict[Pair, tuple[bytes, int]]()
+        self._consistent = dict[Pair, tuple[bytes, int]]()
 
     def num_inliers(self) -> dict[Pair, int]:
         """Return the inliers of the pairs that may be used, 0 of those that are not verified."""
@@ -56,22 +56,14 @@ class SetState:
 
     def models(self) -> list[ModelSummary]:
         """Return what is known of the models before; an empty one where there are none."""
-        models = read_summaries(self.context.workspace.sparse)
-        return models or [
-            ModelSummary(
-                registered_names=(),
-                num_points3D=0,
-                mean_track_length=0.0,
-                mean_reprojection_error_px=0.0,
-            )
-        ]
+        return read_summaries(self.context.workspace.sparse) or [NO_MODEL]
 
     def weights(self, models: Sequence[ModelSummary]) -> dict[str, float]:
         """Return the images to match again, and how much more matches may bring to each.
 
-        Images that no model has weigh 1. Doubtful ones of the first model weigh what matches may
-        add to the probability that they are right, and a quarter of all that where they are likely
-        right in the model that they are in.
+        Images that no model has had weigh 1. Doubtful ones of the first model, and those that were
+        taken out of it, weigh what matches may add to the probability that they are right. All
+        that is a quarter where they are likely right in the model that they are in.
 
         Args:
             models: those before, the largest first.
@@ -134,7 +126,7 @@ class SetState:
         matches = self.context.matches
         num_inliers = self.num_inliers()
         failed = [pair for pair, count in num_inliers.items() if not count]
-        confirming = self._num_confirming(failed)
+        consistent = self._num_consistent(failed)
         levels = matches.levels(num_inliers)
         tried = matches.levels(num_inliers, "tried")
         measured = matches.measured_worths(num_inliers)
@@ -145,7 +137,7 @@ class SetState:
         for pair, count in num_inliers.items():
             states[pair] = PairState(
                 num_inliers=count,
-                num_consistent=confirming.get(pair, 0),
+                num_consistent=consistent.get(pair, 0),
                 level=levels[pair],
                 tried=tried[pair],
                 measured_worth=measured[pair],
@@ -155,7 +147,7 @@ class SetState:
             )
         return states
 
-    def _num_confirming(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+    def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """Return how many raw matches of pairs confirm each other."""
         if not pairs:
             return {}
@@ -166,11 +158,11 @@ class SetState:
                 first, second = pair
                 matches = database.read_matches(graph.ids[first], graph.ids[second])
                 content = matches.tobytes()
-                before = self._confirming.get(pair)
+                before = self._consistent.get(pair)
                 if not before or before[0] != content:
-                    count = num_confirming(self.context.features, pair, matches)
-                    self._confirming[pair] = content, count
-                found[pair] = self._confirming[pair][1]
+                    count = num_consistent(self.context.features, pair, matches)
+                    self._consistent[pair] = content, count
+                found[pair] = self._consistent[pair][1]
         return found
 
     def situation(

@@ -7,6 +7,7 @@ few points are seen by many images, its focal lengths run away.
 
 import copy
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
@@ -147,8 +148,10 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
         self.focal_px = prior.focal_px
         self.mean: Array = np.zeros(number)
         self.weights: Array = np.zeros(number)
-        # Two focal lengths of one camera are one observation, as the score counts them.
-        self.weights[self.focal] = noise_px / prior.sigma / math.sqrt(len(self.focal))
+        if prior.sigma:
+            # Two focal lengths of one camera are one observation, as the score counts them.
+            num_focals = len(self.focal)
+            self.weights[self.focal] = noise_px / prior.sigma / math.sqrt(num_focals)
         self.weights[list(camera.extra_params_idxs())] = noise_px / DISTORTION_SIGMA
         indices = list(camera.principal_point_idxs())
         center = prior.principal_point or usual_principal_point(camera)
@@ -172,6 +175,17 @@ class IntrinsicsCost(pyceres.CostFunction):  # type: ignore[misc]
             slopes[self.focal] /= focals_px
             jacobians[0][:] = np.diag(slopes).ravel()
         return True
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """Where an image of a problem observes a tie point."""
+
+    xy: Array  # (2,) px
+    camera_model: pycolmap.CameraModelId
+    blocks: list[
+        Array
+    ]  # parameters of its pose and of its camera, as the problem has them
 
 
 @dataclass(frozen=True)
@@ -333,26 +347,26 @@ class Adjuster:
         """Add tie points once more, with the weight of their own noise.
 
         COLMAP has added them as points like all others, whose robust loss hardly pulls where a
-        mark is far from its reprojection. Here it does up to the error of marks that fit.
+        mark is far from its reprojection. Here it does up to the error of marks that fit. Where
+        COLMAP leaves out tracks of two images, tie points of two images are added here alone.
         """
         covariance = np.eye(2) * (SIGMA_PX / self.noise_px) ** 2
-        for _, image_id, mark in self.tie_points.observed(model):
-            image = model.images[image_id]
-            camera = model.cameras[image.camera_id]
-            frame = model.frames[image.frame_id]
-            rig = frame.rig
-            is_reference = rig is None or rig.is_ref_sensor(camera.sensor_id)
-            if frame.rig_from_world is None or not is_reference:
+        marks_of = defaultdict[int, list[_Mark]](list)
+        for _, image_id, observed in self.tie_points.observed(model):
+            blocks = _pose_and_camera(model, image_id)
+            if blocks and all(map(problem.has_parameter_block, blocks)):
+                camera = model.cameras[model.images[image_id].camera_id]
+                mark = _Mark(observed.xy, camera.model, blocks)
+                marks_of[observed.point3D_id].append(mark)
+        for point_id, marks in marks_of.items():
+            point = model.points3D[point_id]
+            has_all_marks = len(marks) == point.track.length()
+            if not (problem.has_parameter_block(point.xyz) or has_all_marks):
                 continue
-            blocks = [
-                model.points3D[mark.point3D_id].xyz,
-                frame.rig_from_world.params,
-                camera.params,
-            ]
-            if all(map(problem.has_parameter_block, blocks)):
-                cost = ReprojErrorCost(camera.model, covariance, mark.xy)
+            for mark in marks:
+                cost = ReprojErrorCost(mark.camera_model, covariance, mark.xy)
                 loss = pyceres.CauchyLoss(AGREEING_SIGMAS * self.noise_px)
-                problem.add_residual_block(cost, loss, blocks)
+                problem.add_residual_block(cost, loss, [point.xyz, *mark.blocks])
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         """Keep constant what of a camera is known, and add the prior of what is not."""
@@ -366,12 +380,11 @@ class Adjuster:
             problem.set_manifold(
                 camera.params, pyceres.SubsetManifold(number, constant)
             )
-        if prior.sigma:
-            problem.add_residual_block(
-                IntrinsicsCost(camera, prior, self.noise_px, constant),
-                None,
-                [camera.params],
-            )
+        problem.add_residual_block(
+            IntrinsicsCost(camera, prior, self.noise_px, constant),
+            None,
+            [camera.params],
+        )
 
     def _constant_parameters(self, camera: pycolmap.Camera) -> list[int]:
         """Return the indices of the parameters of a camera that are constant."""
@@ -391,6 +404,21 @@ class Adjuster:
         return bool(prior.principal_point) or (
             self.refining.refine_principal_point and prior.sigma > 0.0
         )
+
+
+def _pose_and_camera(model: pycolmap.Reconstruction, image_id: int) -> list[Array]:
+    """Return the parameters of the pose and of the camera of an image.
+
+    None of a sensor of a rig that is not its reference: the pose of its frame is that of another.
+    """
+    image = model.images[image_id]
+    camera = model.cameras[image.camera_id]
+    frame = model.frames[image.frame_id]
+    rig = frame.rig
+    is_reference = rig is None or rig.is_ref_sensor(camera.sensor_id)
+    if frame.rig_from_world is None or not is_reference:
+        return []
+    return [frame.rig_from_world.params, camera.params]
 
 
 def solver_options(max_iterations: int, num_images: int) -> Any:

@@ -71,7 +71,8 @@ class MappingTask:
     # Of snapshots to go on from; mappers may leave it unused
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None  # stops mapping from outside
-    # pairs of image names that only affine frames verify which were not measured one by one
+    # pairs of image names whose matches are of features without measured affine shapes, which
+    # mistake sides that look alike for each other
     unmeasured_pairs: frozenset[tuple[str, str]] = frozenset()
     # what is known of cameras, by id
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
@@ -129,17 +130,20 @@ class MappedModel:
     # Hypotheses that made the model, in the words of a report
     hypotheses: tuple[str, ...] = ()
     axis_turns_deg: Mapping[str, float] = field(default_factory=dict)
-    """By the names of images: how far rotations change where principal points that points
-    contradict are freed, though that makes no better model."""
+    """How far the rotation of each image changes with free principal points, by name. Only where
+    points leave open whether constant ones are right, and no model with free ones is taken."""
     other_cameras: OtherCameras | None = None
     """What a camera for each image would make of a model whose images share some by assumption, or
     one camera where they have their own."""
-    apart: Mapping[str, Doubt] = field(default_factory=dict)
-    """By the names of images that were in the same model, why they are not in this one."""
-    motion_share: float = 1.0
-    """Share of what moves as the model says, before cameras were freed, which may hide the rest."""
+    why_apart: Mapping[str, Doubt] = field(default_factory=dict)
+    """Why images of another place, which were in one model with these, are not in this one, by
+    name."""
+    share_as_modelled: float = 1.0
+    """Share of what the images show that moves as the model says, 1 where nothing moves otherwise.
+    It was measured before cameras were freed: free ones may fit what moves otherwise."""
     one_place_by: PairGraph | None = None
-    """Pairs that tell that all its images are of one place, where somebody has looked."""
+    """The pairs by which all its images were found to be of one place; None where nothing has
+    looked for places, or they are not clearly one."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
     """Gives a reconstruction its last points and colours; called once, when images are scored."""
 

@@ -62,8 +62,8 @@ class _PosedModel:
         positions = np.array([p.xy for p in keypoints]).reshape(-1, 2)
         points = np.array([self.model.points3D[p.point3D_id].xyz for p in keypoints])
         depths = points.reshape(-1, 3) @ rotation[2] + translation[2]
-        is_before = depths > 0
-        return positions[is_before], depths[is_before]
+        is_in_front = depths > 0
+        return positions[is_in_front], depths[is_in_front]
 
 
 @dataclass(frozen=True)

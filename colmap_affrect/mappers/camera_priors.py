@@ -42,7 +42,7 @@ SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false; numeric
 # Of the logarithm of a focal length of which nothing is expected; theory
 WIDE_SIGMA = 1.0
-MIN_FOCAL_PX = 1e-9  # whose logarithm is taken; numeric
+MIN_FOCAL_PX = 1e-9  # whose logarithm is taken, or which is divided by; numeric
 SAME_PX = 1e-3  # to which two principal points are the same; numeric
 # By which EXIF and lines may differ before they contradict each other; theory
 MAX_DEVIATIONS = 2.5

@@ -47,7 +47,7 @@ MAX_NUM_SAMPLES = 3
 MAX_POINTS_OF_IMAGE = 300
 """That are looked at, to find images that see the same; resource."""
 
-Said = tuple[float, ...]
+GivenPrincipalPoint = tuple[float, ...]
 """A principal point that the user gives, and the size of the images, px."""
 Given = Mapping[int, pycolmap.Camera]
 """Cameras whose principal points the user has given, by id."""
@@ -78,31 +78,31 @@ def contradicted_principal_points(
         return _judged(model, task)
     found = list[PrincipalPointContradiction]()
     names_of = _names_of_same(model, given)
-    largest = sorted(names_of, key=lambda said: (-len(names_of[said]), said))
-    judged = set[Said]()
+    largest = sorted(names_of, key=lambda point: (-len(names_of[point]), point))
+    judged = set[GivenPrincipalPoint]()
     for _ in range(MAX_NUM_SAMPLES):
-        left = [said for said in largest if said not in judged]
+        left = [point for point in largest if point not in judged]
         if not left:
             break
         sample = _sample(model, names_of[left[0]])
-        said_of_sample = set(_names_of_same(sample, given))
+        points_of_sample = set(_names_of_same(sample, given))
         for one in _judged(sample, task):
             whole = _of_all_of_same(one, names_of)
             if whole and whole.turns_deg.keys().isdisjoint(_names(found)):
                 found.append(whole)
-        judged |= {left[0], *said_of_sample}
+        judged |= {left[0], *points_of_sample}
     return found
 
 
 def _names_of_same(
     model: pycolmap.Reconstruction, given: Given
-) -> dict[Said, list[str]]:
+) -> dict[GivenPrincipalPoint, list[str]]:
     """Return the names of the registered images for which the user says the same."""
-    found = defaultdict[Said, list[str]](list)
+    found = defaultdict[GivenPrincipalPoint, list[str]](list)
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
         if image.camera_id in given:
-            found[_said(given[image.camera_id])].append(image.name)
+            found[_given_principal_point(given[image.camera_id])].append(image.name)
     return dict(found)
 
 
@@ -171,7 +171,8 @@ def _frames_that_see_the_same(
 
 
 def _of_all_of_same(
-    one: PrincipalPointContradiction, names_of: Mapping[Said, Collection[str]]
+    one: PrincipalPointContradiction,
+    names_of: Mapping[GivenPrincipalPoint, Collection[str]],
 ) -> PrincipalPointContradiction | None:
     """Return a contradiction of a sample for all images of which the user says the same.
 
@@ -216,7 +217,7 @@ def _given_cameras(
     return found
 
 
-def _said(camera: pycolmap.Camera) -> Said:
+def _given_principal_point(camera: pycolmap.Camera) -> GivenPrincipalPoint:
     """Return a given principal point and the size of the images, px."""
     center = (float(camera.principal_point_x), float(camera.principal_point_y))
     return (*center, float(camera.width), float(camera.height))
@@ -230,7 +231,7 @@ def _ids_of_same(given: Given) -> dict[int, int]:
     firsts = dict[tuple[object, ...], int]()
     found = {}
     for key, camera in sorted(given.items()):
-        first = firsts.setdefault((camera.model, *_said(camera)), key)
+        first = firsts.setdefault((camera.model, *_given_principal_point(camera)), key)
         if first != key:
             found[key] = first
     return found
@@ -311,13 +312,13 @@ def _far_ones(
         model: The model with these.
         free: The same with free ones.
     """
-    groups = defaultdict[Said, list[int]](list)
+    groups = defaultdict[GivenPrincipalPoint, list[int]](list)
     for key, camera in sorted(given.items()):
-        groups[_said(camera)].append(key)
+        groups[_given_principal_point(camera)].append(key)
     turns_deg = median_turns_deg(model, free)
     found = []
-    for said, keys in groups.items():
-        x_px, y_px, *sides_px = said
+    for point, keys in groups.items():
+        x_px, y_px, *sides_px = point
         fitting = _median_principal_point(free, keys)
         move_px = math.dist((x_px, y_px), fitting)
         if move_px > MIN_MOVE * max(sides_px):

@@ -11,10 +11,9 @@ from colmap_affrect.colmap.connections import connected_parts
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.surroundings import Places, places_of
+from colmap_affrect.mappers.surroundings import MIN_PLACE, Places, places_of
 from colmap_affrect.project.reasons import Doubt, DoubtCode
 
-MIN_PLACE = 2  # photographs that make a model; theory
 MIN_GROUP = 3  # photographs: two alone are hardly ever sure, and COLMAP keeps three
 
 
@@ -123,7 +122,7 @@ def _with_why_apart(mapped: MappedModel, why_apart: Mapping[str, Doubt]) -> Mapp
     model = mapped.reconstruction
     inside = {model.images[image_id].name for image_id in model.reg_image_ids()}
     others = {name: why for name, why in why_apart.items() if name not in inside}
-    return replace(mapped, apart=others)
+    return replace(mapped, why_apart=others)
 
 
 def _num_images(mapped: MappedModel) -> int:

@@ -224,11 +224,11 @@ class Grower:
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> int | None:
         """Register one more image by points that it sees; return its id."""
         with_few = self.graph.images_with_few_matches_only
-        options = self.options_for_few_matches if with_few else self.options
-        for image_id in mapper.find_next_images(options, False):
-            options = (
-                self.options_for_few_matches if image_id in with_few else self.options
-            )
+        # Lower limits where any image needs them: each is registered by its own ones below.
+        lowest = self.options_for_few_matches if with_few else self.options
+        for image_id in mapper.find_next_images(lowest, False):
+            has_few = image_id in with_few
+            options = self.options_for_few_matches if has_few else self.options
             if mapper.register_next_image(options, image_id):
                 return image_id
         return None

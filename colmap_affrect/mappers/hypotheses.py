@@ -14,7 +14,7 @@ from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.groups import with_other_groups
 from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN
 from colmap_affrect.mappers.other_cameras import OtherCameras
-from colmap_affrect.mappers.other_motions import share_of_motion
+from colmap_affrect.mappers.other_motions import share_moving_as_modelled
 from colmap_affrect.mappers.own_cameras import (
     MAX_OPEN_IMAGES,
     one_camera,
@@ -152,7 +152,11 @@ class HypothesisTest:
         at the same values as the search, and a second mapping would cost time for nothing else.
         """
         search = self.search
-        if not search.unknown or search.graph.has_rigs or self.task.previous_models:
+        if (
+            not search.unknown_priors
+            or search.graph.has_rigs
+            or self.task.previous_models
+        ):
             return
         try:
             models = self.by_colmap()
@@ -184,7 +188,7 @@ class HypothesisTest:
 
     def _try_straight_lens(self) -> None:
         """Adjust the best model from a straight lens where that leads to a better optimum."""
-        if not self.best or not self.search.unknown:
+        if not self.best or not self.search.unknown_priors:
             return
         model = self.search.from_straight_lens(self.best[0].reconstruction)
         self.best = [replace(self.best[0], reconstruction=model), *self.best[1:]]
@@ -244,8 +248,8 @@ class HypothesisTest:
         search = self.search
         model = self.best[0].reconstruction
         changed = with_shifted_axes(model, free, search.graph)
-        share = self._motion_share(self.best[0])
-        first = replace(self.best[0], reconstruction=changed, motion_share=share)
+        share = self._share_as_modelled(self.best[0])
+        first = replace(self.best[0], reconstruction=changed, share_as_modelled=share)
         found = free.with_bridges(search.graph, [first.also_by(SHIFTED_AXES)])
         found = with_new_images([*found, *self.best[1:]])
         score = free.best_score(found[:1])
@@ -275,8 +279,8 @@ class HypothesisTest:
         if score <= self.score + MIN_SCORE_GAIN:
             return
         self.replaced = first.reconstruction, score - self.score
-        share = self._motion_share(first)
-        changed = replace(first, reconstruction=model, motion_share=share)
+        share = self._share_as_modelled(first)
+        changed = replace(first, reconstruction=model, share_as_modelled=share)
         # The others, too: what is shared and what is not do not fit into one graph.
         others = [_remade(self.per_image, mapped) for mapped in self.best[1:]]
         self.best = with_new_images([changed.also_by(PER_IMAGE_CAMERAS), *others])
@@ -308,10 +312,10 @@ class HypothesisTest:
             return None
         return own_cameras(model, self.search, self.per_image)
 
-    def _motion_share(self, mapped: MappedModel) -> float:
+    def _share_as_modelled(self, mapped: MappedModel) -> float:
         """Return the share of what moves as a model says: other cameras may hide the rest."""
-        found = share_of_motion(mapped.reconstruction, self.search.graph)
-        return min(found, mapped.motion_share)
+        found = share_moving_as_modelled(mapped.reconstruction, self.search.graph)
+        return min(found, mapped.share_as_modelled)
 
 
 def joined_by_hand(search: Search, models: Sequence[MappedModel]) -> list[MappedModel]:

@@ -22,6 +22,7 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     Ids,
@@ -60,17 +61,37 @@ REMOVAL_INTERVAL_S = 0.05  # between them; resource
 
 
 @dataclass(frozen=True)
+class Findings:
+    """What mapping that goes on from a model cannot find again."""
+
+    other_cameras: OtherCameras | None = None
+    """One camera in the place of own ones: which photographs shared it at first is not tried
+    again."""
+    share_as_modelled: float = 1.0
+    """As of a :class:`MappedModel`, before cameras were freed."""
+
+
+@dataclass(frozen=True)
 class _SummaryFile:
     model: dict[str, str]  # digests of its files by name
     summary: ModelSummary
+    findings: Findings = Findings()
 
 
 _SUMMARY_FILE = TypeAdapter(_SummaryFile)
 
 
-def write_summary(summary: ModelSummary, folder: Path) -> None:
-    """Keep the summary of the model in a folder."""
-    content = _SummaryFile(file_digests(folder), summary)
+def write_summary(
+    summary: ModelSummary, folder: Path, findings: Findings | None = None
+) -> None:
+    """Keep the summary of the model in a folder.
+
+    Args:
+        summary: Of the model.
+        folder: Of the model.
+        findings: What mapping that goes on from it needs; by default nothing was found.
+    """
+    content = _SummaryFile(file_digests(folder), summary, findings or Findings())
     write_sealed(folder / SUMMARY, _SUMMARY_FILE.dump_json(content))
 
 
@@ -82,7 +103,7 @@ def copy_with_keypoints(folder: Path, target: Path, database_path: Path) -> None
         target: New folder of the copy.
         database_path: The database of the model; new keypoints follow those that there were.
     """
-    summary = read_summary(folder)
+    known = _read_summary_file(folder)
     model = pycolmap.Reconstruction(folder)
     with open_database(database_path) as database:
         for image in model.images.values():
@@ -91,7 +112,7 @@ def copy_with_keypoints(folder: Path, target: Path, database_path: Path) -> None
             for xy in new:
                 image.points2D.append(pycolmap.Point2D(xy))
     write_model(model, target)
-    write_summary(summary, target)
+    write_summary(known.summary, target, known.findings)
 
 
 def read_summary(folder: Path) -> ModelSummary:
@@ -99,16 +120,40 @@ def read_summary(folder: Path) -> ModelSummary:
 
     StoreError if there is none, or it or the model is damaged: somebody may have edited the model.
     """
+    return _read_summary_file(folder).summary
+
+
+def _read_summary_file(folder: Path) -> _SummaryFile:
     require_intact(folder)
     again = how_to_make_again("map", folder.parent.parent)
     mend = f"if you have edited the model, copy it to a folder of its own; then {again}"
     with damage(folder / SUMMARY, mend):
-        return _SUMMARY_FILE.validate_python(read_sealed(folder / SUMMARY)).summary
+        return _SUMMARY_FILE.validate_python(read_sealed(folder / SUMMARY))
 
 
 def read_summaries(sparse_path: Path) -> list[ModelSummary]:
     """Return the summaries of the models that mapping has written, in their order."""
     return [read_summary(folder) for folder in model_folders(sparse_path)]
+
+
+def read_models(sparse_path: Path) -> list[MappedModel]:
+    """Return the models that mapping has written, in their order, to go on from them.
+
+    StoreError as :func:`read_summary`.
+    """
+    models = list[MappedModel]()
+    for folder in model_folders(sparse_path):
+        known = _read_summary_file(folder)
+        models.append(
+            MappedModel(
+                reconstruction=pycolmap.Reconstruction(folder),
+                bridges=known.summary.bridges,
+                hypotheses=known.summary.hypotheses,
+                other_cameras=known.findings.other_cameras,
+                share_as_modelled=known.findings.share_as_modelled,
+            )
+        )
+    return models
 
 
 def model_folders(sparse_path: Path) -> list[Path]:
@@ -327,7 +372,12 @@ def _write_models(
             model.mapped.add_last_points(model.mapped.reconstruction)
         write_model(model.mapped.reconstruction, path)
         summary = _summary(model, task)
-        write_summary(summary, path)
+        other = model.mapped.other_cameras
+        findings = Findings(
+            other_cameras=other if other and other.are_shared else None,
+            share_as_modelled=model.mapped.share_as_modelled,
+        )
+        write_summary(summary, path, findings)
         summaries.append(summary)
     return summaries
 

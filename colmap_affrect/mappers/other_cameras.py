@@ -41,11 +41,16 @@ class OtherCameras:
 
     def pose_of(self, name: str) -> OtherPose:
         """Return the pose of an image with these cameras."""
-        probability = 0.5 * (1.0 + math.tanh(0.5 * self.log_odds))
+        probability = probability_of(self.log_odds)
         return OtherPose(probability, self.turns_deg.get(name, 0.0), self.are_shared)
 
 
 NO_OTHER_CAMERAS = OtherCameras()
+
+
+def probability_of(log_odds: float) -> float:
+    """Return the probability of log odds, of any size."""
+    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
 
 
 def pose_turns_deg(
@@ -82,7 +87,7 @@ def median_changes(
     Args:
         model: Has the images.
         image_ids: Of the images.
-        change: Of two images, in either order the same.
+        change: Of two images; what their order changes is small, and does not count.
 
     Returns:
         By image name; nothing of an image alone.

@@ -85,7 +85,7 @@ class _Motions:
         return num_chained >= MIN_CHAINED * len(self.other)
 
 
-def share_of_motion(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
+def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -> float:
     """Return the share of what moves as a model says, where something moves in another way, too.
 
     Args:

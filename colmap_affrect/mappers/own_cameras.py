@@ -56,10 +56,10 @@ def _compared(
         model: The model, whose images share cameras.
         other: The same with a camera for each image.
         shared: Scores the model.
-        scorer: Scores the other one, by some of the tracks.
+        scorer: Scores the other one. Both are scored by the pairs and tracks of its graph.
     """
     other_score = scorer.score(other)
-    score = replace(shared.scorer, graph=shared.graph.thinned()).score(model)
+    score = replace(shared.scorer, graph=scorer.graph).score(model)
     return OtherCameras(other_score - score, pose_turns_deg(model, other))
 
 

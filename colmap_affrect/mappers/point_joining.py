@@ -26,6 +26,7 @@ from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
     cameras_of,
     poses_of,
+    used_cameras,
 )
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.tie_joining import moved_onto
@@ -105,13 +106,17 @@ class PointJoiner:
         Args:
             whole: The model.
             first: One part.
-            second: The other one. What is said of common images counts once.
+            second: The other one. What is said of common images and cameras counts once.
         """
         score = self.scorer.score
         common = set(first.reconstruction.reg_image_ids())
         common.intersection_update(second.reconstruction.reg_image_ids())
+        cameras = used_cameras(second.reconstruction)
+        shared = cameras.keys() & used_cameras(first.reconstruction).keys()
         of_parts = score(first.reconstruction) + score(second.reconstruction)
         of_parts -= self._said_of(second.reconstruction, common)
+        for key in sorted(shared):
+            of_parts += self.scorer.priors[key].cost_of(cameras[key])
         least = -MIN_SCORE_GAIN if common else MIN_SCORE_GAIN
         return score(whole) - of_parts > least
 

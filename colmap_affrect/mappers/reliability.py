@@ -15,7 +15,7 @@ from pathlib import Path
 
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import MAX_GROWTH, MIN_GROWTH
-from colmap_affrect.mappers.other_cameras import OtherPose
+from colmap_affrect.mappers.other_cameras import OtherPose, probability_of
 from colmap_affrect.mappers.reliability_features import ReliabilityFeatures, features_of
 from colmap_affrect.project.reasons import Doubt
 
@@ -33,7 +33,7 @@ CHANCE_INLIERS = 35.0  # of an edge that is as likely of two scenes as of one (j
 # Inliers more that make the former less likely by a factor of e (judged)
 CHANCE_SCALE = 10.0
 MAX_ERROR_DEG = 5.0  # of poses that count as right, in BENCHMARKS and in the fit; paper
-MIN_SHARE = 1e-9  # of a probability, whose logarithm is taken; numeric
+TINY_SHARE = 1e-9  # of a probability, whose logarithm is taken; numeric
 MIN_SIGMA_DEG = 1e-3  # of directions; they are divided by; numeric
 # Of the log odds: what takes less, half of the odds, is no reason to doubt; theory
 MIN_LOSS = 0.7
@@ -208,9 +208,9 @@ def confidence(features: ReliabilityFeatures) -> Confidence:
         losses.append(loss)
         if name in OF_MATCHES:
             mendable += max(0.0, loss.log_odds)
-    probability = _probability(log_odds) * factor
+    probability = probability_of(log_odds) * factor
     precision_factor = _precision_factor(features)
-    with_matches = _probability(log_odds + mendable) * precision_factor
+    with_matches = probability_of(log_odds + mendable) * precision_factor
     gain = with_matches - probability
     return Confidence(
         probability=probability,
@@ -270,7 +270,7 @@ def _losses_by_other_cameras(features: ReliabilityFeatures) -> list[_Loss]:
 def _share_with_other_cameras(other: OtherPose) -> float:
     """Return the probability that a pose is within the limit, by other cameras or not."""
     is_near = share_within_limit(other.turn_deg)
-    return max(1.0 - other.probability * (1.0 - is_near), MIN_SHARE)
+    return max(1.0 - other.probability * (1.0 - is_near), TINY_SHARE)
 
 
 def _odds_of_two_scenes(features: ReliabilityFeatures) -> float:
@@ -293,11 +293,6 @@ def share_within_limit(sigma_deg: float) -> float:
     """
     sigma_deg = max(sigma_deg, MIN_SIGMA_DEG)
     return -math.expm1(-((MAX_ERROR_DEG / sigma_deg) ** 2))
-
-
-def _probability(log_odds: float) -> float:
-    """Return the probability of log odds, of any size."""
-    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
 
 
 def _main_reasons(losses: list[_Loss]) -> tuple[Doubt, ...]:

@@ -17,6 +17,7 @@ from colmap_affrect.geometry.parallax import Size, mirrored_share, pure_rotation
 from colmap_affrect.mappers.adjustment import NOISE_PX, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import (
+    MIN_FOCAL_PX,
     camera_priors,
     is_off_center,
     with_distortion_of,
@@ -63,7 +64,6 @@ MIN_MIRRORED_SHARE = 0.5
 images a tenth by chance; measured."""
 # Looked at, all of 45 photographs; of more some copies are missed; resource
 MAX_MIRRORED_PAIRS = 1000
-MIN_FOCAL_PX = 1e-9  # focal lengths are divided by; numeric
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class ReliabilityFeatures:
     direction_sigma_deg: float = 0.0
     """Deviation that the directions of translation to at least half of the others do not exceed."""
     axis_turn_deg: float = 0.0
-    """How far its rotations to others change with free principal points, where points contradict
-    those that are constant and nothing tells where they are."""
+    """How far its rotations to others change with free principal points, where points leave open
+    whether constant ones are right."""
     with_free_focals: OtherPose = NO_OTHER_POSE
     """Its pose where given focal lengths are free."""
     with_other_cameras: OtherPose = NO_OTHER_POSE
@@ -113,7 +113,10 @@ class _ModelContext:
         self.cameras = cameras_of(self.model)
         self.used_cameras = used_cameras(self.model)
         used = self.used_cameras.values()
-        priors = camera_priors(used, task.cameras, task.lines)
+        # Those of the model have moved from the focal lengths that EXIF says.
+        before = {camera.camera_id: camera for camera in self.graph.cameras.values()}
+        known = [before.get(camera.camera_id, camera) for camera in used]
+        priors = camera_priors(known, task.cameras, task.lines)
         self.priors = with_distortion_of(priors, used)
         self.scorer = ModelScorer(self.graph, self.priors)
         self.pairs = self.graph.pairs_inside(self.poses)

@@ -45,7 +45,7 @@ def certain_models_of_rigs(
         return []
     if len(models) != 1:
         return []
-    are_known = not search.unknown
+    are_known = not search.unknown_priors
     model = models[0].reconstruction
-    is_certain = search.is_certain(model, search.graph, agrees=are_known)
+    is_certain = search.is_certain(model, search.graph, focals_agree=are_known)
     return [models[0].first_by(COLMAP_MODEL)] if is_certain else []

@@ -9,7 +9,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.focal_observability import focal_growths
 from colmap_affrect.mappers.given_principal_points import contradicted_principal_points
-from colmap_affrect.mappers.other_motions import share_of_motion
+from colmap_affrect.mappers.other_motions import share_moving_as_modelled
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
     MIN_SHARE,
@@ -26,13 +26,14 @@ from colmap_affrect.mappers.reliability import (
 )
 from colmap_affrect.mappers.small_motions import small_motion
 from colmap_affrect.mappers.surer_apart import surer_apart
-from colmap_affrect.mappers.surroundings import apart, known_places
+from colmap_affrect.mappers.surroundings import cut_into_places, known_places
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, PrincipalPointContradiction
 
-# Of the angle between poses by what moves and by the rest; judged
-CHANGE_SIGMA_DEG = 1.5
-NEGLIGIBLE = 0.01  # chance of wrong poses by a small motion, which is not told; judged
+CHANGE_SIGMA_DEG = 1.7
+"""Of the angle between poses by what moves and by the rest: what poses by the rest were off in a
+made-up set, the median (measured)."""
+NEGLIGIBLE = 0.01  # chance of wrong poses by a small motion, which is not told; numeric
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
 (theory)."""
@@ -68,9 +69,9 @@ def scored_places(mapped: MappedModel, task: MappingTask) -> list[ScoredModel]:
         return [whole]
     places = known_places(mapped, graph)
     places = surer_apart(mapped, places, lambda one: _probabilities(one, task))
-    largest, *others = apart(mapped, places)
+    largest, *others = cut_into_places(mapped, places)
     scored = _without_wrong_images(largest, task)
-    for name, doubt in mapped.apart.items():
+    for name, doubt in mapped.why_apart.items():
         scored.taken_out[name] = Confidence(0.0, (doubt,))
     found = [scored]
     for other in others:
@@ -101,8 +102,8 @@ def _probabilities(mapped: MappedModel, task: MappingTask) -> dict[int, float]:
 def _doubt_motion(model: ScoredModel, task: MappingTask) -> None:
     """Doubt a model where something moves in another way: that may be the scene as well."""
     graph = graph_of(task, MIN_NUM_MATCHES)
-    found = share_of_motion(model.mapped.reconstruction, graph)
-    share = min(found, model.mapped.motion_share)
+    found = share_moving_as_modelled(model.mapped.reconstruction, graph)
+    share = min(found, model.mapped.share_as_modelled)
     if share < 1.0:
         doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})
         for name in list(model.confidences):

@@ -45,7 +45,9 @@ class _Attempt:
 
     models: list[MappedModel]  # best first
     score: float  # of the first
-    agrees: bool  # its unknown focal lengths ended near those that it was made with
+    focals_agree: (
+        bool  # its unknown focal lengths ended near those that it was made with
+    )
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Search:
 
     def best(self, graph: PairGraph) -> list[MappedModel]:
         """Return the best model, then the best ones of images that none before has."""
-        best = _Attempt([], -math.inf, agrees=False)
+        best = _Attempt([], -math.inf, focals_agree=False)
         initial = self._with_initial_focals()
         pending = list(initial)
         while pending:
@@ -97,9 +99,9 @@ class Search:
             if attempt.score > best.score:
                 best = attempt
                 lacks_bridges = self._lacks_bridges(search, graph, model)
-                if search in initial and (lacks_bridges or not attempt.agrees):
+                if search in initial and (lacks_bridges or not attempt.focals_agree):
                     pending.insert(0, self._with_focals_of(model))
-            if self.is_certain(model, graph, agrees=attempt.agrees):
+            if self.is_certain(model, graph, focals_agree=attempt.focals_agree):
                 break
         grower = self.grower(graph)
         for mapped in best.models:
@@ -156,10 +158,10 @@ class Search:
         """
         if not models:
             return []
-        if not self.builds_bridges or not graph.unexplained_by(
-            models[0].reconstruction
-        ):
+        if not graph.unexplained_by(models[0].reconstruction):
             return [models[0]]
+        if not self.builds_bridges:
+            return with_new_images(models)
         grower = self.grower(graph)
         bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
         joined = list[MappedModel]()
@@ -168,14 +170,18 @@ class Search:
         return with_new_images([max(joined, key=self._score), *models])
 
     def is_certain(
-        self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
+        self,
+        model: pycolmap.Reconstruction,
+        graph: PairGraph,
+        *,
+        focals_agree: bool = True,
     ) -> bool:
         """Tell whether a model has all connected images, and pairs or tracks confirm it.
 
         Args:
             model: The model in question.
             graph: Pairs that it should explain.
-            agrees: Whether its unknown focal lengths are those that it was made with.
+            focals_agree: Whether its unknown focal lengths are those that it was made with.
 
         Returns:
             Whether no pair contradicts it and its focal lengths agree, or tracks of three images
@@ -185,9 +191,9 @@ class Search:
         has_all = inside.issuperset(graph.keypoints)
         if not has_all and not inside.issuperset(graph.largest_component):
             return False
-        return (agrees and not graph.contradicted(model)) or self.scorer.is_confirmed(
-            model
-        )
+        return (
+            focals_agree and not graph.contradicted(model)
+        ) or self.scorer.is_confirmed(model)
 
     def from_straight_lens(
         self, model: pycolmap.Reconstruction
@@ -230,7 +236,7 @@ class Search:
         return replace(self, adjuster=replace(self.adjuster, compares_only=True))
 
     @cached_property
-    def unknown(self) -> dict[int, CameraPrior]:
+    def unknown_priors(self) -> dict[int, CameraPrior]:
         """Priors of the unknown focal lengths, by camera id."""
         priors = self.adjuster.priors
         return {
@@ -243,7 +249,7 @@ class Search:
     def _shared(self) -> set[int]:
         """Cameras with an unknown focal length that several images share."""
         counts = Counter(camera.camera_id for camera in self.graph.cameras.values())
-        return {key for key in self.unknown if counts[key] > 1}
+        return {key for key in self.unknown_priors if counts[key] > 1}
 
     def _score(self, mapped: MappedModel) -> float:
         return self.scorer.score(mapped.reconstruction)
@@ -254,7 +260,7 @@ class Search:
         Where no images share a camera, only the first one builds bridges, to save time; another
         one that wins is repeated with bridges.
         """
-        numbers = [len(prior.starts_px) for prior in self.unknown.values()]
+        numbers = [len(prior.starts_px) for prior in self.unknown_priors.values()]
         searches = [self._with_start(0)]
         if self.tries_focals:
             for number in range(1, max(numbers, default=1)):
@@ -267,7 +273,7 @@ class Search:
     def _with_start(self, number: int) -> Self:
         """Return a search whose unknown focal lengths begin at one of their starts, or the last."""
         priors = {}
-        for key, prior in self.unknown.items():
+        for key, prior in self.unknown_priors.items():
             sigma = (
                 min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma
             )
@@ -283,7 +289,7 @@ class Search:
         priors = {}
         for key, focal_px in self._unknown_focals(model).items():
             priors[key] = replace(
-                self.unknown[key], focal_px=focal_px, sigma=SHARED_SIGMA
+                self.unknown_priors[key], focal_px=focal_px, sigma=SHARED_SIGMA
             )
         return self._adjusting_with(priors)
 
@@ -296,17 +302,17 @@ class Search:
         """Grow models with the focal lengths of another search; then these may change."""
         found = search.with_bridges(graph, search._grown(graph, graph.pairs))
         if not found:
-            return _Attempt([], -math.inf, agrees=False)
+            return _Attempt([], -math.inf, focals_agree=False)
         model = found[0].reconstruction
-        if self.unknown:
+        if self.unknown_priors:
             self.grower(graph).adjust_fully(model, MEDIUM)
-        agrees = search._agrees(model)
+        focals_agree = search._focals_agree(model)
         score = self.scorer.score(model)
-        if agrees:  # with other focal lengths, bridges have a wrong length
+        if focals_agree:  # with other focal lengths, bridges have a wrong length
             score += MIN_SCORE_GAIN
-        return _Attempt(models=found, score=score, agrees=agrees)
+        return _Attempt(models=found, score=score, focals_agree=focals_agree)
 
-    def _agrees(self, model: pycolmap.Reconstruction) -> bool:
+    def _focals_agree(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether unknown focal lengths ended near those with which a model was made."""
         for key, focal_px in self._unknown_focals(model).items():
             change = math.log(focal_px / self.adjuster.priors[key].focal_px)
@@ -318,7 +324,8 @@ class Search:
         """Return the focal lengths of the used cameras whose prior is unknown, by camera id."""
         used = used_cameras(model)
         return {
-            k: used[k].mean_focal_length() for k in used.keys() & self.unknown.keys()
+            k: used[k].mean_focal_length()
+            for k in used.keys() & self.unknown_priors.keys()
         }
 
     def _grown(

@@ -9,10 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.surroundings import Places, apart
+from colmap_affrect.mappers.surroundings import MIN_PLACE, Places, cut_into_places
 from colmap_affrect.project.report import DOUBTFUL, expected_right_poses
-
-MIN_PART = 2  # photographs that make a model; theory
 
 Probabilities = Mapping[int, float]  # by image id
 Score = Callable[[MappedModel], Probabilities]
@@ -31,7 +29,7 @@ def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
         poses are expected to be right than of the whole, single images among them, which make no
         model; else the places as they are.
     """
-    models = [part for part in places.tied if len(part) >= MIN_PART]
+    models = [part for part in places.tied if len(part) >= MIN_PLACE]
     if len(places.images) > 1 or len(models) < 2:
         return places
     together = dict(score(_copied(mapped)))
@@ -43,8 +41,8 @@ def surer_apart(mapped: MappedModel, places: Places, score: Score) -> Places:
     parts = sorted(places.tied, key=lambda part: (-len(part), min(part)))
     cut = replace(places, images=parts, unclear={}, why="surer_apart")
     expected = 0.0
-    for part in apart(_copied(mapped), cut):
-        if part.reconstruction.num_reg_images() >= MIN_PART:
+    for part in cut_into_places(_copied(mapped), cut):
+        if part.reconstruction.num_reg_images() >= MIN_PLACE:
             expected += expected_right_poses(score(part).values())
     return cut if expected > expected_right_poses(together.values()) else places
 

@@ -30,6 +30,7 @@ from colmap_affrect.mappers.model_score import (
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph
 from colmap_affrect.project.reasons import DoubtCode
 
+MIN_PLACE = 2  # photographs that make a model; theory
 MIN_POINTS = 4  # expected of a cell that counts: fewer may be lost by chance (judged)
 MAX_ANGLE_DEG = 40.0
 """Between the rays of two photographs to a point: beyond, matching loses much (judged)."""
@@ -257,10 +258,10 @@ class _Views:
 def _projected(camera: pycolmap.Camera, local: Array) -> Array:
     """Return the (N, 2) px of (N, 3) points, -1 of those behind the camera."""
     points_px = np.full((len(local), 2), -1.0)
-    is_before = local[:, 2] > 0
-    if is_before.any():
-        projected = np.asarray(camera.img_from_cam(local[is_before]), np.float64)
-        points_px[is_before] = np.where(np.isfinite(projected), projected, -1.0)
+    is_in_front = local[:, 2] > 0
+    if is_in_front.any():
+        projected = np.asarray(camera.img_from_cam(local[is_in_front]), np.float64)
+        points_px[is_in_front] = np.where(np.isfinite(projected), projected, -1.0)
     return points_px
 
 
@@ -430,7 +431,8 @@ def _partners_between(
 def _joint_log_ratio(overlaps: Sequence[Overlap]) -> float:
     """Return the log-likelihood ratio of images that err together, at least in part.
 
-    It grows with the root of their number, as if each told half of what it tells alone.
+    It is between their mean, as of images that all err together, and their sum, as of independent
+    ones: it grows with the root of their number.
     """
     ratios = [overlap.log_ratio for overlap in overlaps if overlap.has_enough]
     return float(np.sum(ratios) / np.sqrt(len(ratios))) if ratios else 0.0
@@ -462,7 +464,7 @@ def _cut_at_collages(
     return [place]
 
 
-def apart(mapped: MappedModel, places: Places) -> list[MappedModel]:
+def cut_into_places(mapped: MappedModel, places: Places) -> list[MappedModel]:
     """Return a model for each place that a model holds; itself, without the others, is the first.
 
     Args:

@@ -215,8 +215,11 @@ def _position(nearby: "_NearbyDepths", marks: Mapping[int, Array]) -> Array | No
     if position is not None:
         return position
     # Where rays do not meet, the residuals will say so.
-    image_id, xy = next(iter(marks.items()))
-    return nearby.position(image_id, xy)
+    for image_id, xy in marks.items():
+        position = nearby.position(image_id, xy)
+        if position is not None:
+            return position
+    return None
 
 
 def _mark_error_px(

@@ -38,8 +38,9 @@ class RectifierInputs:
 
 
 Warps = Literal["none", "some", "all tilts"]
-"""Which views a rectifier adds to a photograph: none; those that its content or its depth asks
-for; all tilts, whatever the photograph shows."""
+"""Which views a rectifier adds to a photograph: none; some, such as those that its content or its
+depth asks for, or a few that are always the same; all tilts, those of a cover of all directions,
+whatever the photograph shows."""
 
 
 class RectifierOptions(PartOptions):

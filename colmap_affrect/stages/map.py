@@ -14,7 +14,7 @@ from colmap_affrect.errors import ConflictError, Option
 from colmap_affrect.geometry.lines import LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
-from colmap_affrect.mappers.mapping import map_database, model_folders, read_summaries
+from colmap_affrect.mappers.mapping import map_database, read_models, read_summaries
 from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.wrong_models import ThrownAway, read_thrown_away
 from colmap_affrect.pairs.lists import Pair
@@ -77,11 +77,11 @@ def map_images(
         models = read_summaries(workspace.sparse)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
-    known_models = read_summaries(workspace.sparse)  # refuses edited ones
+    read_summaries(workspace.sparse)  # refuses edited ones
     said_before = known.by_hand if known else ""
     before = list[MappedModel]()
     if begins_with_models and said_before == inputs.by_hand:
-        before = _models_before(workspace.sparse, known_models)
+        before = read_models(workspace.sparse)
     context.graph.close()  # mappers open the database, and SQLite's own copy copies it
     task = _task(context, extend, before)
     workspace.record_mapping(None)  # a run that is killed begins anew
@@ -90,17 +90,6 @@ def map_images(
     workspace.record_mapping(inputs)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models)), models
-
-
-def _models_before(
-    sparse_path: Path, summaries: Sequence[ModelSummary]
-) -> list[MappedModel]:
-    """Return the models that are there, to begin with."""
-    models = list[MappedModel]()
-    for folder, summary in zip(model_folders(sparse_path), summaries, strict=True):
-        model = pycolmap.Reconstruction(str(folder))
-        models.append(MappedModel(model, summary.bridges, summary.hypotheses))
-    return models
 
 
 def _task(
@@ -130,7 +119,7 @@ def _make_mapped_database(
     """Make the database that is mapped, a copy where somebody has changed something by hand.
 
     Returns:
-        Its path, and the keypoints of tie points: indices by image and point.
+        Its path, and the keypoints of tie points: indices by point and image name.
     """
     workspace = context.workspace
     by_hand = context.by_hand

@@ -274,8 +274,8 @@ def _worth_all_features(
         matched = matched_at_level(context, sample, options, 0, may_give_up=may_give_up)
         with closing(matched) as found:
             by_all = list(found)
-        num_after = _sum_confirming(context.features, by_all)
-        num_before = _sum_confirming(context.features, matches.read(sample))
+        num_after = _sum_consistent(context.features, by_all)
+        num_before = _sum_consistent(context.features, matches.read(sample))
         is_in_vain = brings_nothing(num_before, num_after)
         known = (digest, is_in_vain)
         matches.choose([] if is_in_vain else by_all, {}, in_vain=known)
@@ -296,11 +296,11 @@ def brings_nothing(num_before: int, num_after: int) -> bool:
     return num_after == 0 or num_after < MIN_GROWTH * num_before
 
 
-def _sum_confirming(features: FeatureStore, found: Iterable[PairMatches]) -> int:
-    return sum(num_confirming(features, one.names, one.indices) for one in found)
+def _sum_consistent(features: FeatureStore, found: Iterable[PairMatches]) -> int:
+    return sum(num_consistent(features, one.names, one.indices) for one in found)
 
 
-def num_confirming(features: FeatureStore, names: Pair, indices: Any) -> int:
+def num_consistent(features: FeatureStore, names: Pair, indices: Any) -> int:
     """Return how many of the (M, 2) raw matches of a pair confirm each other."""
     first = features.read_frames(names[0])
     second = features.read_frames(names[1])

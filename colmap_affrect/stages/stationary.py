@@ -68,8 +68,9 @@ class _StillCells:
     """Cells of photographs of one size."""
 
     still: Mask  # nothing moves there, to the pixel
-    is_most: bool  # nothing moves far in most of what is matched
-    is_most_exact: bool  # nothing moves there, to the pixel
+    # Whether most cells with matches are such, or cells where nothing moves far
+    still_are_most: bool
+    nearly_still_are_most: bool
 
 
 @dataclass(frozen=True)
@@ -185,22 +186,22 @@ class StationaryFilter:
         A call that was killed may have dropped some: what it found is on record and counts too.
         """
         found = self._find(pairs)
-        idle = list[StageWarning]()
+        still_camera = list[StageWarning]()
         for size, places in found.items():
             if not places.still.any():
                 continue
-            if places.is_most and not self._moves_elsewhere(
+            if places.nearly_still_are_most and not self._moves_elsewhere(
                 pairs, size, places=places.still
             ):
-                idle = [StageWarning("camera_stands_still", SUBJECT)]
+                still_camera = [StageWarning("camera_stands_still", SUBJECT)]
             else:
                 self._still_masks[size] = places.still | self._still_masks.get(
                     size, places.still
                 )
-                if places.is_most_exact:
+                if places.still_are_most:
                     self._of_still_cameras.add(size)
         if not self._still_masks:
-            return idle
+            return still_camera
         self._learn_backgrounds(pairs)
         self._record()
         num_pairs = num_matches = 0
@@ -212,7 +213,7 @@ class StationaryFilter:
                 num_pairs += 1
                 num_matches += len(before.indices) - len(after.indices)
         if not num_pairs:
-            return idle
+            return still_camera
         values: dict[str, int | str] = {
             "num_matches": num_matches,
             "num_pairs": num_pairs,
@@ -287,8 +288,8 @@ class StationaryFilter:
                 limit = MAX_SHARE_OF_PHOTOGRAPH * (counts >= MIN_NUM_PAIRS).sum()
                 places[size] = _StillCells(
                     still=likely & exact,
-                    is_most=bool(likely.sum() > limit),
-                    is_most_exact=bool((likely & exact).sum() > limit),
+                    still_are_most=bool((likely & exact).sum() > limit),
+                    nearly_still_are_most=bool(likely.sum() > limit),
                 )
         return places
 

@@ -240,3 +240,18 @@ def test_what_is_said_differs_by_pairs_and_by_photographs_and_not_by_their_order
     assert len({one.digest() for one in said}) == len(said)
     both = ByHand(left_out=("a.jpg", "b.jpg"))
     assert both.digest() == ByHand(left_out=("b.jpg", "a.jpg")).digest()
+
+
+def test_marks_whose_rays_meet_behind_the_cameras_have_no_position() -> None:
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_PINHOLE", 800.0, 1000, 600
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for image_id, x in ((1, -1.0), (2, 1.0)):
+        image = pycolmap.Image(f"{image_id}.jpg", np.zeros((1, 2)), 1, image_id)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-x, 0.0, 0.0]))
+        model.add_image_with_trivial_frame(image, pose)
+    left, right = np.array([300.0, 300.0]), np.array([700.0, 300.0])
+    assert triangulated(model, {1: left, 2: right}) is None
+    assert triangulated(model, {1: right, 2: left}) == pytest.approx([0.0, 0.0, 4.0])

@@ -402,7 +402,11 @@ def test_photographs_of_one_body_with_several_shapes_are_crops_of_the_largest(
     tmp_path: Path,
 ) -> None:
     """Programs that crop may leave out the size that EXIF had."""
-    tags = {**BODY, "FocalLength": 50.0, "FocalLengthIn35mmFilm": 50}
+    tags = {
+        **BODY,
+        "FocalLength": 50.0,
+        "FocalLengthIn35mmFilm": 50,
+    }
     photos = tmp_path / "photos"
     for name, size in (
         ("whole.jpg", (1500, 1000)),
@@ -416,11 +420,17 @@ def test_photographs_of_one_body_with_several_shapes_are_crops_of_the_largest(
     write_photograph(photos / "cut.jpg", (800, 760), tags)
     with_crop = InitialCameras(photos, CameraOptions())
     whole_px = 50.0 / math.hypot(36.0, 24.0) * math.hypot(1500.0, 1000.0)
-    for name, size in (("whole.jpg", (1500, 1000)), ("upright.jpg", (1000, 1500))):
+    for name, size in (
+        ("whole.jpg", (1500, 1000)),
+        ("upright.jpg", (1000, 1500)),
+    ):
         _, record = with_crop.camera([name], size)
         assert record.source == "exif"
         assert record.focal_px == pytest.approx(whole_px, rel=0.01)
-    for name, size in (("cut.jpg", (800, 760)), ("same.jpg", (900, 600))):
+    for name, size in (
+        ("cut.jpg", (800, 760)),
+        ("same.jpg", (900, 600)),
+    ):
         _, record = with_crop.camera([name], size)
         assert record.source == "guess"
         assert record.uncropped_px == pytest.approx(whole_px, rel=0.01)

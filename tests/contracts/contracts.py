@@ -5,19 +5,15 @@ Subclass, say how a part is made, and pytest runs the rest.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from line_scenes import corner_of_walls
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scene import INTRINSICS, NAMES
 from synthetic import texture, unit_rows
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import (
     GrayImage,
     LocalFeatures,
@@ -26,7 +22,6 @@ from colmap_affrect.data import (
     RectificationPlan,
     View,
 )
-from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import lafs_from_keypoints, project, transform_lafs
@@ -35,17 +30,9 @@ from colmap_affrect.geometry.tilts import (
     metrics_from_tilts,
     unit_metrics,
 )
-from colmap_affrect.mappers.base import (
-    MAPPERS,
-    MappedModel,
-    Mapper,
-    MapperOptions,
-    MappingTask,
-)
-from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.matchers.base import ImageFeatures, Matcher
+from colmap_affrect.matchers.base import ImageFeatures, Matcher, Matches
 from colmap_affrect.recipes import ExtractionOptions
-from colmap_affrect.rectifiers.base import Rectifier
+from colmap_affrect.rectifiers.base import Rectifier, RectifierOptions
 from colmap_affrect.stages.one_image import ImageExtractor
 
 UNIT_LENGTH_ERROR = 1e-4
@@ -56,8 +43,19 @@ MAX_WARPED_AREAS = 100.0
 """Canvas areas of all warps of an image together, in image areas: the 24 of the near-optimal
 cover at full area, each in a rotated bounding box, with room."""
 NUM_THINGS = 60
+SAME_SCORE = 1e-3
 METRIC_ERROR = 1e-6
 """Of the metric of a warp in the middle of its region, in float64."""
+
+TURNED_PX = 0.5
+"""In a turned image an error of half a pixel counts twice; the bias of pyramids is less."""
+TURNED_DEG = 20.0
+MOVED_PX = 32
+"""A whole number of cells of all networks."""
+
+MIN_SAME = 0.1
+"""Of features of an image whose nearest descriptor in a part of it is of the same place: 0.99 for
+RootSIFT, 0.16 for a network of random weights, nearly none by chance."""
 
 IMAGES = {
     "textured": texture((117, 163), 7),
@@ -69,6 +67,16 @@ IMAGES = {
     "tiny": texture((7, 5), 5),
     "smallest rectified": texture((33, 32), 6),
 }
+
+
+RECTIFIED_IMAGES = {
+    **IMAGES,
+    "widened": cv2.resize(texture((40, 90), 9), (120, 90)),
+    "corner of walls": cv2.resize(
+        corner_of_walls(), (240, 160), interpolation=cv2.INTER_AREA
+    ),
+}
+"""For those that warp what is not seen from the front."""
 
 
 def photograph_of(image: GrayImage) -> Photograph:
@@ -87,6 +95,9 @@ class Contract:
 class ExtractorContract(Contract):
     """Of a feature extractor."""
 
+    frames_turn = True
+    """Whether frames turn with the image: not those of upright features, nor of random weights."""
+
     def extract(self, view: View) -> LocalFeatures:
         extractor: FeatureExtractor = self.make()
         features = extractor.describe([view[0]], [extractor.detect(view)])[0]
@@ -102,7 +113,10 @@ class ExtractorContract(Contract):
         assert (features.responses > 0).all()
         lengths = np.linalg.norm(features.descriptors, axis=1)
         assert_allclose(lengths, 1.0, atol=UNIT_LENGTH_ERROR)
-        assert is_inside(features.keypoints, (image.shape[1], image.shape[0])).all()
+        size = (image.shape[1], image.shape[0])
+        assert is_inside(features.keypoints, size).all(), (
+            "keypoints outside of the image: x comes first, then y"
+        )
         if kind == "textured":
             assert len(features) > 10
         if kind in ("flat", "black"):
@@ -115,7 +129,49 @@ class ExtractorContract(Contract):
         mask[:, :70] = 255
         features = self.extract((image, mask))
         assert len(features)
-        assert (np.rint(features.keypoints[:, 0]) < 70).all()
+        assert (np.rint(features.keypoints[:, 0]) < 70).all(), (
+            "features where the mask is 0: x comes first, then y"
+        )
+
+    def test_image_and_mask_are_left_alone(self) -> None:
+        image = IMAGES["textured"].copy()
+        mask = np.full_like(image, 255)
+        mask[:, :70] = 0
+        given = mask.copy()
+        self.extract((image, mask))
+        assert_array_equal(image, IMAGES["textured"], "the image has been changed")
+        assert_array_equal(mask, given, "the mask has been changed")
+
+    def test_features_with_like_descriptors_show_the_same_place(self) -> None:
+        """In an image and in what is left of it without its first columns."""
+        image = texture((320, 256), 4)
+        whole = self.extract((image, None))
+        part = self.extract((np.ascontiguousarray(image[:, MOVED_PX:]), None))
+        nearest = (part.descriptors @ whole.descriptors.T).argmax(axis=1)
+        moved = whole.keypoints[nearest] - part.keypoints
+        is_same = np.abs(moved - (MOVED_PX, 0.0)).max(axis=1) < 1.0
+        assert is_same.mean() > MIN_SAME, (
+            "descriptors are not those of the keypoints in the same rows, or x is not before y"
+        )
+
+    def test_features_turn_with_the_image(self) -> None:
+        """Coordinates are those of pixel centres, and frames are turned as what they show."""
+        if not self.frames_turn:
+            pytest.skip("its frames do not turn with the image")
+        image = texture((240, 180), 8)
+        upright = self.extract((image, None))
+        turned = self.extract((np.ascontiguousarray(np.rot90(image)), None))
+        quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, image.shape[1] - 1.0]])
+        expected = quarter[:, :2] @ upright.lafs
+        expected[:, :, 2] += quarter[:, 2]
+        off_px, off_deg = differences_from_nearest(expected, turned.lafs)
+        assert np.abs(np.median(off_px, axis=0)).max() < TURNED_PX, (
+            "keypoints are not in pixel-centre px, where (0, 0) is the middle of the first pixel"
+        )
+        assert np.median(off_deg) < TURNED_DEG, (
+            "frames do not turn with the image: their angle is another one, or turns the other "
+            "way; frames_turn = False says that features are upright"
+        )
 
     def test_images_together_and_one_by_one_give_the_same_every_time(self) -> None:
         extractor: FeatureExtractor = self.make()
@@ -132,10 +188,32 @@ class ExtractorContract(Contract):
         assert_array_equal(again[0].descriptors, together[0].descriptors)
 
 
-def image_of(things: np.ndarray, seed: int) -> ImageFeatures:
+def differences_from_nearest(
+    expected: np.ndarray, found: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (N, 2) px and (N,) degrees from frames to those found next to them.
+
+    Of several in one place the one counts that is turned likewise.
+    """
+    offsets = found[None, :, :, 2] - expected[:, None, :, 2]
+    distances = np.linalg.norm(offsets, axis=2)
+    is_nearest = distances <= distances.min(axis=1, keepdims=True) + ROUNDING_PX
+    angles = [np.arctan2(one[:, 1, 0], one[:, 0, 0]) for one in (expected, found)]
+    turns = np.abs(np.angle(np.exp(1j * (angles[1][None, :] - angles[0][:, None]))))
+    best = np.where(is_nearest, turns, np.inf).argmin(axis=1)
+    rows = np.arange(len(expected))
+    return offsets[rows, best], np.rad2deg(turns[rows, best])
+
+
+def things_to_see() -> np.ndarray:
+    """(N, 128) descriptors of things, none like another."""
+    return np.random.default_rng(0).gamma(0.4, size=(NUM_THINGS, 128))
+
+
+def image_of(things: np.ndarray, seed: int, noise: float = 0.02) -> ImageFeatures:
     """Features that show some things, their descriptors a bit otherwise in every image."""
     random = np.random.default_rng(seed)
-    rows = unit_rows(things + 0.02 * random.random(things.shape))
+    rows = unit_rows(things + noise * random.random(things.shape))
     count = len(things)
     centers = random.uniform((10.0, 20.0), (400.0, 280.0), (count, 2))
     lafs = lafs_from_keypoints(centers, random.uniform(3, 9, count), np.zeros(count))
@@ -148,7 +226,7 @@ class MatcherContract(Contract):
 
     @pytest.fixture
     def things(self) -> np.ndarray:
-        return np.random.default_rng(0).gamma(0.4, size=(NUM_THINGS, 128))
+        return things_to_see()
 
     def test_same_things_are_matched_in_rising_order_of_the_first_image(
         self, things
@@ -158,15 +236,37 @@ class MatcherContract(Contract):
         first = image_of(things, 2)
         second = image_of(things[order], 3)
         found = matcher.match(matcher.prepare(first), matcher.prepare(second))
-        assert found.indices.dtype == np.int64
-        assert found.indices.shape == (len(found.scores), 2)
-        assert (np.diff(found.indices[:, 0]) > 0).all()
-        assert len(np.unique(found.indices[:, 1])) == len(found.indices)
-        right = order[found.indices[:, 1]] == found.indices[:, 0]
-        assert right.mean() > 0.95
-        assert right.sum() > 15  # a matcher may keep the better half
-        assert found.scores.dtype == np.float32
-        assert ((found.scores >= 0.0) & (found.scores <= 1.0)).all()
+        check_matches(found, len(first.features), len(second.features))
+        check_right(order[found.indices[:, 1]] == found.indices[:, 0])
+
+    def test_second_image_may_have_more_features(self, things) -> None:
+        matcher: Matcher = self.make()
+        order = np.random.default_rng(1).permutation(NUM_THINGS)[:45]
+        first = image_of(things[order], 3)
+        second = image_of(things, 2)
+        found = matcher.match(matcher.prepare(first), matcher.prepare(second))
+        check_matches(found, len(first.features), len(second.features))
+        check_right(order[found.indices[:, 0]] == found.indices[:, 1])
+
+    def test_scores_of_clear_matches_are_not_smaller(self, things) -> None:
+        matcher: Matcher = self.make()
+        first = matcher.prepare(image_of(things, 2))
+        clear = matcher.match(first, matcher.prepare(image_of(things, 3)))
+        noisy = matcher.match(first, matcher.prepare(image_of(things, 3, 0.4)))
+        best = clear.scores.max(initial=0.0)
+        assert best >= noisy.scores.max(initial=0.0) - SAME_SCORE, (
+            "larger scores have to be better ones"
+        )
+
+    def test_features_are_left_alone(self, things) -> None:
+        matcher: Matcher = self.make()
+        first = image_of(things, 2)
+        matcher.match(matcher.prepare(first), matcher.prepare(image_of(things, 3)))
+        assert_array_equal(
+            first.features.descriptors,
+            image_of(things, 2).features.descriptors,
+            "descriptors have been changed",
+        )
 
     def test_images_without_features_have_no_matches(self, things) -> None:
         matcher: Matcher = self.make()
@@ -190,8 +290,30 @@ class MatcherContract(Contract):
         assert_array_equal(matcher.match(first, second).indices, before.indices)
 
 
+def check_matches(found: Matches, num_first: int, num_second: int) -> None:
+    """Matches are well formed for images with so many features."""
+    assert found.indices.dtype == np.int64
+    assert found.scores.dtype == np.float32
+    fault = found.fault(num_first, num_second)
+    assert not fault, (
+        f"matches with {fault}: column 0 is of image 1, column 1 of image 2"
+    )
+
+
+def check_right(is_right: np.ndarray) -> None:
+    assert is_right.mean() > 0.95, "features that show other things are matched"
+    assert is_right.sum() > 15, "a matcher may keep the better half"
+
+
 class RectifierContract(Contract):
     """Of a rectifier."""
+
+    finds_warps = True
+    """Whether there is something to warp in some of the images, for a rectifier that warps."""
+
+    def options(self) -> RectifierOptions:
+        """Return the options of the rectifier under test."""
+        raise NotImplementedError
 
     def extractor(self) -> ImageExtractor:
         rectifier: Rectifier = self.make()
@@ -199,14 +321,15 @@ class RectifierContract(Contract):
             ExtractionOptions(), (RootSift(SiftOptions()),), (rectifier,)
         )
 
-    @pytest.mark.parametrize("kind", IMAGES)
+    @pytest.mark.parametrize("kind", RECTIFIED_IMAGES)
     def test_plan_keeps_the_invariants_and_features_their_region(
         self, kind: str
     ) -> None:
-        photograph = photograph_of(IMAGES[kind].copy())
+        image = RECTIFIED_IMAGES[kind]
+        photograph = photograph_of(image.copy())
         extractor = self.extractor()
         plan, _ = extractor.plan(photograph)
-        assert_array_equal(photograph.gray, IMAGES[kind])  # which is left alone
+        assert_array_equal(photograph.gray, image, "the photograph has been changed")
         assert plan.image_size == photograph.size
         if plan.original_region is not None:
             assert plan.original_region.shape == photograph.gray.shape
@@ -222,8 +345,27 @@ class RectifierContract(Contract):
             assert item.in_region(of_warp.keypoints).all()
 
     def test_plan_is_the_same_every_time(self) -> None:
-        photograph = photograph_of(IMAGES["textured"])
-        assert_same_plan(*(self.extractor().plan(photograph)[0] for _ in range(2)))
+        """Also by one rectifier that has planned for another photograph meanwhile."""
+        photograph = photograph_of(RECTIFIED_IMAGES["widened"])
+        extractor = self.extractor()
+        plan, _ = extractor.plan(photograph)
+        extractor.plan(photograph_of(IMAGES["textured"]))
+        assert_same_plan(plan, extractor.plan(photograph)[0])
+        assert_same_plan(plan, self.extractor().plan(photograph)[0])
+
+    def test_warps_are_as_many_as_the_options_say(self) -> None:
+        """And somewhere there are some, or nothing else of this contract says anything."""
+        rectifier: Rectifier = self.make()
+        warps = self.options().warps
+        counts = {}
+        for kind, image in RECTIFIED_IMAGES.items():
+            counts[kind] = len(rectifier.plan(photograph_of(image)).items)
+        is_found = self.finds_warps and warps != "none"
+        assert any(counts.values()) == is_found, (
+            f"Options.warps is {warps!r}, but the numbers of warps are {counts}"
+        )
+        if warps == "all tilts":
+            assert counts["flat"], "all tilts are there whatever the photograph shows"
 
 
 def check_rectification(item: Rectification, size: tuple[int, int]) -> None:
@@ -246,19 +388,25 @@ def check_numbers(item: Rectification) -> None:
     assert np.isfinite(item.image_from_rectified).all()
     assert min(item.canvas_size) >= 1
     assert item.tilt >= 1.0
-    assert 0.0 <= item.tilt_angle_rad < np.pi
+    assert 0.0 <= item.tilt_angle_rad < np.pi, "radians, from 0 up to pi"
 
 
 def check_mapping(item: Rectification, points: np.ndarray) -> None:
     """A warp takes points onto its canvas, none through the horizon, and mirrors none."""
     matrix = item.rectified_from_image
-    assert (points @ matrix[2, :2] + matrix[2, 2] > 0).all()
+    assert (points @ matrix[2, :2] + matrix[2, 2] > 0).all(), "beyond the horizon"
     mapped = project(matrix, points)
-    assert (mapped >= -ROUNDING_PX).all()
-    assert (mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX).all()
+    is_on_canvas = (mapped >= -ROUNDING_PX).all() and (
+        mapped <= np.array(item.canvas_size) - 1 + ROUNDING_PX
+    ).all()
+    assert is_on_canvas, (
+        f"the region goes from {mapped.min(axis=0)} to {mapped.max(axis=0)} of a canvas of "
+        f"{item.canvas_size}: rectified_from_image takes px of the photograph to px of the warp"
+    )
     shapes = np.tile(np.eye(2), (len(points), 1, 1))
     frames = np.concatenate([shapes, points[:, :, None]], axis=2)
-    assert (np.linalg.det(transform_lafs(matrix, frames)[:, :, :2]) > 0).all()
+    areas = np.linalg.det(transform_lafs(matrix, frames)[:, :, :2])
+    assert (areas > 0).all(), "the warp is mirrored"
 
 
 def check_direction(item: Rectification, middle: np.ndarray) -> None:
@@ -269,7 +417,13 @@ def check_direction(item: Rectification, middle: np.ndarray) -> None:
     frame = np.concatenate([np.eye(2), middle[:, None]], axis=1)
     (mapped,) = transform_lafs(item.rectified_from_image, frame[None])
     said = metrics_from_tilts([item.tilt], [item.tilt_angle_rad])
-    assert_allclose(unit_metrics(mapped[None, :, :2]), said, atol=METRIC_ERROR)
+    assert_allclose(
+        unit_metrics(mapped[None, :, :2]),
+        said,
+        atol=METRIC_ERROR,
+        err_msg="the warp is stretched otherwise than tilt and tilt_angle_rad say: its map may be "
+        "the one from the warp to the photograph",
+    )
 
 
 def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> None:
@@ -279,79 +433,3 @@ def assert_same_plan(first: RectificationPlan, second: RectificationPlan) -> Non
         assert one.canvas_size == other.canvas_size
         assert one.region_origin == other.region_origin
         np.testing.assert_equal(one.region, other.region)
-
-
-class MapperContract(Contract):
-    """Of a mapper."""
-
-    def options(self) -> MapperOptions:
-        """Return the options of the mapper under test."""
-        raise NotImplementedError
-
-    def make(self) -> Mapper:
-        return MAPPERS.make(self.options())
-
-    def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
-        self, task: MappingTask, tmp_path: Path
-    ) -> None:
-        shown: list[int] = []
-        (model, *_) = map_database(self.make(), task, tmp_path / "sparse", shown.append)
-        assert model.registered_names == tuple(sorted(NAMES))
-        assert sum(shown) == len(NAMES)
-        assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
-        written = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
-        (camera,) = written.cameras.values()
-        given = [float(value) for value in INTRINSICS.split(",")]
-        assert camera.params.tolist() == given, "a given camera has changed"
-
-    def test_mapper_has_presets_and_refuses_unknown_options(self) -> None:
-        options = self.options().changed(random_seed=5, mapper_options={})
-        colmap = type(options).preset("colmap")
-        assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")
-        with pytest.raises(OptionError, match="no such option"):
-            MAPPERS.make(options.changed(mapper_options={"nonsense": 1}))
-
-    def test_mapper_makes_no_model_or_says_why_where_no_pair_is_verified(
-        self, unmatched_task: MappingTask, tmp_path: Path
-    ) -> None:
-        found: list[MappedModel] = []
-        with suppress(AffrectError):
-            found = self.make().map(unmatched_task, tmp_path, 0, lambda _: None)
-        assert found == []
-
-    def test_mapper_that_is_stopped_raises_and_leaves_no_model(
-        self, task: MappingTask, tmp_path: Path
-    ) -> None:
-        token = pycolmap.CancellationToken()
-        token.cancel()
-        stopped = replace(task, cancellation=token)
-        with pytest.raises(KeyboardInterrupt):
-            map_database(self.make(), stopped, tmp_path / "sparse", lambda _: None)
-        assert not (tmp_path / "sparse").exists()
-
-    @pytest.mark.long
-    def test_mapper_makes_the_same_model_in_two_threads_at_once(
-        self, task: MappingTask, tmp_path: Path
-    ) -> None:
-        """Neither is the main one, which alone may handle signals."""
-        mapper = self.make()
-
-        def poses(number: int) -> dict[str, list[float]]:
-            folder = tmp_path / str(number)
-            folder.mkdir()
-            (model, *_) = mapper.map(task, folder, 0, lambda _: None)
-            return poses_by_name(model.reconstruction)
-
-        with ThreadPoolExecutor(2) as threads:
-            first, second = threads.map(poses, (1, 2))
-        assert first.keys() == set(NAMES)
-        assert first == second
-
-
-def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, list[float]]:
-    """Return the matrix of each registered image in one row."""
-    found = {}
-    for image in model.images.values():
-        if image.has_pose:
-            found[image.name] = image.cam_from_world().matrix().ravel().tolist()
-    return found

@@ -14,10 +14,11 @@ import pytest
 import small_run
 from contracts.contracts import (
     ExtractorContract,
-    MapperContract,
     MatcherContract,
     RectifierContract,
 )
+from contracts.mapper_contract import MapperContract
+from deciding_numbers import Module, all_numbers, faults
 from small_comparison import make_comparison
 from small_scene import NAMES
 from synthetic import texture, write_image
@@ -31,7 +32,12 @@ from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Level, load_recipe
-from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs
+from colmap_affrect.rectifiers.base import (
+    RECTIFIERS,
+    Rectifier,
+    RectifierInputs,
+    RectifierOptions,
+)
 from colmap_affrect.report import run_page
 from colmap_affrect.session.context import Context, Inputs
 from colmap_affrect.stages.extract import extract
@@ -91,8 +97,11 @@ class TestOrb(ExtractorContract):
 
 
 class TestAlongStreet(RectifierContract):
+    def options(self) -> RectifierOptions:
+        return RECTIFIERS.options("along-street")
+
     def make(self) -> Rectifier:
-        return RECTIFIERS.make(RECTIFIERS.options("along-street"), RectifierInputs())
+        return RECTIFIERS.make(self.options(), RectifierInputs())
 
 
 class TestPlain(MapperContract):
@@ -130,6 +139,17 @@ def test_example_passes_lint_where_it_is_to_be(name: str, check: str) -> None:
         command, input=code, cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_numbers_of_an_example_may_be_added_to_those_of_the_package(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = all_numbers()
+    monkeypatch.setattr("deciding_numbers.ROOT", tmp_path)
+    path = tmp_path / "example.py"
+    path.write_text(example(name)[1], encoding="utf-8")
+    assert faults([*known, *Module(path).numbers()]) == []
 
 
 @needs("mypy")

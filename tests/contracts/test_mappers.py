@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from contracts.contracts import MapperContract
+from contracts.mapper_contract import MapperContract
 
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 

@@ -61,6 +61,7 @@ class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)
     def _case(self, case: str, weights: dict[str, Path]) -> None:
         options = EXTRACTORS.options(FEATURES[case])
+        self.frames_turn = not options.uses_network
         self.extractor = EXTRACTORS.make(options, NetworkContext(weights))
 
     def make(self) -> FeatureExtractor:
@@ -130,10 +131,14 @@ RECTIFIER_CASES: dict[str, tuple[RectifierOptions, RectifierInputs]] = {
 class TestRectifier(RectifierContract):
     @pytest.fixture(autouse=True)
     def _name(self, name: str) -> None:
-        self.options, self.sources = RECTIFIER_CASES[name]
+        self.options_of_case, self.sources = RECTIFIER_CASES[name]
+        self.finds_warps = name != "depth-planes without depth"
+
+    def options(self) -> RectifierOptions:
+        return self.options_of_case
 
     def make(self) -> Rectifier:
-        return RECTIFIERS.make(self.options, self.sources)
+        return RECTIFIERS.make(self.options(), self.sources)
 
 
 UNIT_ERROR = 1e-4

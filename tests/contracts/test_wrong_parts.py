@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
-import signal
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from contracts.contracts import MapperContract, RectifierContract
+from contracts.contracts import (
+    ExtractorContract,
+    MatcherContract,
+    RectifierContract,
+    things_to_see,
+)
 from numpy.linalg import inv
 
-from colmap_affrect.data import Photograph, RectificationPlan
+from colmap_affrect.data import LocalFeatures, Photograph, RectificationPlan, View
+from colmap_affrect.features.base import FeatureExtractor
+from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import fit_canvas, image_corners
-from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
+from colmap_affrect.matchers.base import (
+    MATCHERS,
+    ImageFeatures,
+    Matcher,
+    MatcherContext,
+    Matches,
+)
 from colmap_affrect.rectifiers.affine_warps import AsiftOptions, plan_whole_image
-from colmap_affrect.rectifiers.base import Rectifier
+from colmap_affrect.rectifiers.base import (
+    RECTIFIERS,
+    Rectifier,
+    RectifierInputs,
+    RectifierOptions,
+)
+from colmap_affrect.rectifiers.regions import Region
 
 TILT = 2.0
 ANGLE_RAD = 0.4
@@ -45,9 +63,48 @@ class WrongWayRound:
         return replace(plan, items=(warp,))
 
 
+class OffItsCanvas:
+    """Its map is half a pixel off."""
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        shift = np.eye(3)
+        shift[:2, 2] = -0.5
+        centers = np.array([[TILT, ANGLE_RAD]])
+        plan = plan_whole_image(photograph.size, centers, AsiftOptions())
+        (item,) = plan.items
+        matrix = shift @ item.rectified_from_image
+        return replace(plan, items=(replace(item, rectified_from_image=matrix),))
+
+
+class OtherRegion:
+    """Says of a region that it is where its mask begins, not where that is in the photograph."""
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        region = Region(mask=np.ones((20, 20), bool), origin=(60, 40))
+        item = AsiftOptions().warp(region, TILT, ANGLE_RAD, 0)
+        return RectificationPlan(
+            photograph.size, (replace(item, region_origin=(0, 0)),)
+        )
+
+
+class Remembers:
+    """Plans for the first photograph alone."""
+
+    def __init__(self) -> None:
+        self.known = False
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        centers = np.array([[TILT, ANGLE_RAD]] * (not self.known)).reshape(-1, 2)
+        self.known = True
+        return plan_whole_image(photograph.size, centers, AsiftOptions())
+
+
 class OneRectifier(RectifierContract):
     def __init__(self, rectifier: Rectifier) -> None:
         self.rectifier = rectifier
+
+    def options(self) -> RectifierOptions:
+        return AsiftOptions()
 
     def make(self) -> Rectifier:
         return self.rectifier
@@ -57,93 +114,197 @@ class OneRectifier(RectifierContract):
 def test_warps_in_another_direction_than_they_say_are_found(
     rectifier: Rectifier,
 ) -> None:
-    contract = OneRectifier(rectifier)
-    with pytest.raises(AssertionError, match="Not equal to tolerance"):
-        contract.test_plan_keeps_the_invariants_and_features_their_region("textured")
+    with pytest.raises(AssertionError, match="stretched otherwise than tilt"):
+        OneRectifier(
+            rectifier
+        ).test_plan_keeps_the_invariants_and_features_their_region("textured")
 
 
-class Incremental:
-    """COLMAP's incremental mapper, for others to change what it does."""
-
-    def __init__(self) -> None:
-        self.right = MAPPERS.make(MAPPERS.options("incremental"))
-        self.options = self.right.options
-
-    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
-        return self.right.map(task, *others)
+def test_warps_half_a_pixel_off_their_canvas_are_found() -> None:
+    with pytest.raises(AssertionError, match="of a canvas of"):
+        OneRectifier(
+            OffItsCanvas()
+        ).test_plan_keeps_the_invariants_and_features_their_region("textured")
 
 
-class MovesCameras(Incremental):
-    """Changes cameras that are given."""
-
-    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
-        models = super().map(task, *others)
-        for camera in models[0].reconstruction.cameras.values():
-            camera.params = [*camera.params[:-1], camera.params[-1] + 0.01]
-        return models
+def test_region_in_another_place_than_its_warp_is_found() -> None:
+    with pytest.raises(AssertionError, match="of a canvas of"):
+        OneRectifier(
+            OtherRegion()
+        ).test_plan_keeps_the_invariants_and_features_their_region("widened")
 
 
-class NeverStops(Incremental):
-    """Does not look at the token."""
-
-    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
-        task = replace(task, cancellation=None)
-        return super().map(task, *others)
+def test_rectifier_that_remembers_photographs_is_found() -> None:
+    with pytest.raises(AssertionError):
+        OneRectifier(Remembers()).test_plan_is_the_same_every_time()
 
 
-class FailsAsItLikes(Incremental):
-    """Does not expect that there may be no model."""
-
-    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
-        models = super().map(task, *others)
-        return [models[0]]
+def test_rectifier_that_warps_nothing_or_other_than_it_says_is_found() -> None:
+    identity = RECTIFIERS.make(RECTIFIERS.options("identity"), RectifierInputs())
+    with pytest.raises(AssertionError, match="is 'all tilts'"):
+        OneRectifier(identity).test_warps_are_as_many_as_the_options_say()
 
 
-class HandlesSignals(Incremental):
-    """Works in the main thread alone."""
+class WrongExtractor(FeatureExtractor):
+    """RootSIFT, whose features are changed."""
 
-    def map(self, task: MappingTask, *others: Any) -> list[MappedModel]:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        return super().map(task, *others)
+    descriptor_size = 128
+
+    def __init__(
+        self, change: Callable[[LocalFeatures, View], LocalFeatures | None]
+    ) -> None:
+        self.change = change
+
+    def detect(self, view: View) -> LocalFeatures:
+        features = RootSift(SiftOptions()).detect(view)
+        return self.change(features, view) or features
 
 
-class OneMapper(MapperContract):
-    def __init__(self, mapper: Mapper) -> None:
-        self.mapper = mapper
-
-    def make(self) -> Mapper:
-        return self.mapper
+CENTERS = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+"""Of frames: 1 where the keypoint is."""
+OTHER_SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]])
 
 
-def test_mapper_that_moves_given_cameras_is_found(
-    task: MappingTask, tmp_path: Path
+def exchange(features: LocalFeatures, _: View) -> LocalFeatures:
+    exchanged = np.where(CENTERS > 0.0, features.lafs[:, ::-1], features.lafs)
+    return replace(features, lafs=exchanged)
+
+
+def move_half_a_pixel(features: LocalFeatures, _: View) -> LocalFeatures:
+    return replace(features, lafs=features.lafs + 0.5 * CENTERS)
+
+
+def turn_the_other_way(features: LocalFeatures, _: View) -> LocalFeatures:
+    return replace(features, lafs=features.lafs * OTHER_SIGNS)
+
+
+def mix_up_descriptors(features: LocalFeatures, _: View) -> LocalFeatures:
+    return replace(features, descriptors=features.descriptors[::-1])
+
+
+def change_the_image(_: LocalFeatures, view: View) -> None:
+    view[0][0, 0] += 1
+
+
+class OneExtractor(ExtractorContract):
+    def __init__(self, change: Callable[..., LocalFeatures | None]) -> None:
+        self.change = change
+
+    def make(self) -> FeatureExtractor:
+        return WrongExtractor(self.change)
+
+
+def test_extractor_that_exchanges_x_and_y_is_found() -> None:
+    contract = OneExtractor(exchange)
+    with pytest.raises(AssertionError, match="x comes first, then y"):
+        contract.test_features_are_well_formed("textured")
+    with pytest.raises(AssertionError, match="x is not before y"):
+        contract.test_features_with_like_descriptors_show_the_same_place()
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (move_half_a_pixel, "pixel-centre px"),
+        (turn_the_other_way, "turns the other way"),
+    ],
+)
+def test_features_that_do_not_turn_with_the_image_are_found(
+    change: Callable[..., LocalFeatures], what: str
 ) -> None:
-    contract = OneMapper(MovesCameras())
-    with pytest.raises(AssertionError, match="a given camera has changed"):
-        contract.test_mapper_registers_tells_of_it_and_keeps_given_cameras(
-            task, tmp_path
-        )
+    with pytest.raises(AssertionError, match=what):
+        OneExtractor(change).test_features_turn_with_the_image()
 
 
-def test_mapper_that_does_not_stop_is_found(task: MappingTask, tmp_path: Path) -> None:
-    contract = OneMapper(NeverStops())
-    with pytest.raises(pytest.fail.Exception, match="DID NOT RAISE"):
-        contract.test_mapper_that_is_stopped_raises_and_leaves_no_model(task, tmp_path)
+def test_descriptors_of_other_keypoints_are_found() -> None:
+    with pytest.raises(AssertionError, match="not those of the keypoints"):
+        OneExtractor(
+            mix_up_descriptors
+        ).test_features_with_like_descriptors_show_the_same_place()
 
 
-def test_mapper_that_fails_by_errors_of_its_own_is_found(
-    unmatched_task: MappingTask, tmp_path: Path
-) -> None:
-    contract = OneMapper(FailsAsItLikes())
+def test_extractor_that_changes_the_image_is_found() -> None:
+    with pytest.raises(AssertionError, match="the image has been changed"):
+        OneExtractor(change_the_image).test_image_and_mask_are_left_alone()
+
+
+class WrongMatcher:
+    """The usual matcher, for others to change."""
+
+    right = MATCHERS.make(MATCHERS.options("nearest"), MatcherContext())
+
+    def prepare(self, image: ImageFeatures) -> Any:
+        return self.right.prepare(image)
+
+    def match(self, first: Any, second: Any) -> Matches:
+        return self.right.match(first, second)
+
+
+class SwapsColumns(WrongMatcher):
+    """Gives the features of image 2 first."""
+
+    def match(self, first: Any, second: Any) -> Matches:
+        found = super().match(first, second)
+        return Matches(found.indices[:, ::-1], found.scores)
+
+
+class NeedsFewer(WrongMatcher):
+    """Fails where image 2 has more features."""
+
+    def match(self, first: Any, second: Any) -> Matches:
+        if second.nbytes > first.nbytes:
+            raise IndexError
+        return super().match(first, second)
+
+
+class SmallerIsBetter(WrongMatcher):
+    """Gives distances for scores."""
+
+    def match(self, first: Any, second: Any) -> Matches:
+        found = super().match(first, second)
+        return Matches(found.indices, np.float32(1.0) - found.scores)
+
+
+class ChangesFeatures(WrongMatcher):
+    """Works on what it was given."""
+
+    def prepare(self, image: ImageFeatures) -> Any:
+        image.features.descriptors[:] *= -1.0
+        return super().prepare(image)
+
+
+class OneMatcher(MatcherContract):
+    def __init__(self, matcher: Matcher) -> None:
+        self.matcher = matcher
+
+    def make(self) -> Matcher:
+        return self.matcher
+
+
+THINGS = things_to_see()
+
+
+def test_matcher_that_swaps_columns_is_found() -> None:
+    with pytest.raises(AssertionError, match="column 0 is of image 1"):
+        OneMatcher(
+            SwapsColumns()
+        ).test_same_things_are_matched_in_rising_order_of_the_first_image(THINGS)
+
+
+def test_matcher_that_needs_fewer_features_in_image_2_is_found() -> None:
+    contract = OneMatcher(NeedsFewer())
+    contract.test_same_things_are_matched_in_rising_order_of_the_first_image(THINGS)
     with pytest.raises(IndexError):
-        contract.test_mapper_makes_no_model_or_says_why_where_no_pair_is_verified(
-            unmatched_task, tmp_path
+        contract.test_second_image_may_have_more_features(THINGS)
+
+
+def test_matcher_whose_smaller_scores_are_better_is_found() -> None:
+    with pytest.raises(AssertionError, match="larger scores have to be better"):
+        OneMatcher(SmallerIsBetter()).test_scores_of_clear_matches_are_not_smaller(
+            THINGS
         )
 
 
-def test_mapper_for_the_main_thread_alone_is_found(
-    task: MappingTask, tmp_path: Path
-) -> None:
-    contract = OneMapper(HandlesSignals())
-    with pytest.raises(ValueError, match="signal only works in main thread"):
-        contract.test_mapper_makes_the_same_model_in_two_threads_at_once(task, tmp_path)
+def test_matcher_that_changes_features_is_found() -> None:
+    with pytest.raises(AssertionError, match="descriptors have been changed"):
+        OneMatcher(ChangesFeatures()).test_features_are_left_alone(THINGS)

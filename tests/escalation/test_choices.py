@@ -241,7 +241,7 @@ def test_a_pair_is_worth_its_inliers_or_else_its_consistent_matches(
 ) -> None:
     context = context_in(tmp_path)
     context.features.read_frames = lambda name: name
-    monkeypatch.setattr(escalate, "num_confirming", lambda *_: 6)
+    monkeypatch.setattr(escalate, "num_consistent", lambda *_: 6)
     verifier: Any = SimpleNamespace(inliers=lambda *_: [(0, 1)] * num_inliers)
     escalation = escalation_of(context)
     assert escalation._worth(matches_of("a", "b", 1), verifier) == worth
@@ -289,6 +289,29 @@ def test_pairs_that_have_learned_matches_are_not_matched_again(
     monkeypatch.setattr(escalation, "write", lambda: None)
     assert escalation.match_learned() == 1
     assert matched == [([("b", "c")], 2)]
+
+
+def test_pairs_that_were_rejected_since_are_not_matched_by_learned_matching(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing else is known of them any more."""
+    pairs = (("a", "c"), ("b", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    context.deadline_s = float("inf")
+    escalation = escalation_of(context)
+    levels = {("a", "c"): -1, ("b", "c"): -1}
+    stores: Any = escalation.matches
+    stores.learned_levels = lambda asked: {pair: levels[pair] for pair in asked}
+    matched = list[Any]()
+    monkeypatch.setattr(
+        escalation, "_match_with", lambda batch, *_: matched.extend(batch)
+    )
+    monkeypatch.setattr(escalation, "write", lambda: None)
+    assert escalation.match_learned() == 1
+    assert matched == [("b", "c")]
+    assert not escalation.has_all_learned_matches
+    levels["b", "c"] = 2
+    assert escalation.has_all_learned_matches
 
 
 def test_images_get_the_features_that_they_lack_of_a_level_and_of_its_base(

@@ -97,15 +97,15 @@ def test_matches_are_looked_at_again_where_they_are_others(
     )
     looked_at = list[int]()
 
-    def num_confirming(_: object, __: object, indices: np.ndarray) -> int:
+    def num_consistent(_: object, __: object, indices: np.ndarray) -> int:
         looked_at.append(len(indices))
         return 10 * len(indices)
 
-    monkeypatch.setattr(set_state, "num_confirming", num_confirming)
-    assert state._num_confirming([("a", "b")]) == {("a", "b"): 40}
-    assert state._num_confirming([("a", "b")]) == {("a", "b"): 40}
+    monkeypatch.setattr(set_state, "num_consistent", num_consistent)
+    assert state._num_consistent([("a", "b")]) == {("a", "b"): 40}
+    assert state._num_consistent([("a", "b")]) == {("a", "b"): 40}
     matches = np.zeros((7, 2), np.uint32)
-    assert state._num_confirming([("a", "b")]) == {("a", "b"): 70}
+    assert state._num_consistent([("a", "b")]) == {("a", "b"): 70}
     assert looked_at == [4, 7]
 
 
@@ -225,7 +225,7 @@ def test_a_strong_pair_is_matched_again_where_a_wrong_model_stood_on_it(
         strong_num_inliers=100,
     )
     level = load_recipe("default").levels[1]
-    assert len(planner.candidates(1, level, others=0b10)) == num
+    assert len(planner.candidates(1, level, needless_after=0b10)) == num
 
 
 def test_images_that_measured_frames_connect_to_likely_ones_are_anchored() -> None:

@@ -113,8 +113,17 @@ def test_downwards_is_where_the_lower_edge_of_the_picture_is_stored(
     tmp_path: Path, number: int
 ) -> None:
     stored = np.full((40, 60), 20, np.uint8)
-    right, down = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1),
-                   5: (1, 0), 6: (1, 0), 7: (-1, 0), 8: (-1, 0)}[number]  # fmt: skip
+    expected = {
+        1: (0, 1),
+        2: (0, 1),
+        3: (0, -1),
+        4: (0, -1),
+        5: (1, 0),
+        6: (1, 0),
+        7: (-1, 0),
+        8: (-1, 0),
+    }
+    right, down = expected[number]
     columns = slice(None) if right == 0 else slice(30, 60) if right > 0 else slice(30)
     rows = slice(None) if down == 0 else slice(20, 40) if down > 0 else slice(20)
     stored[rows, columns] = 220

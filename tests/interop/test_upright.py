@@ -123,8 +123,12 @@ def test_photographs_that_are_stored_on_their_side_have_their_own_upright(
     up_in_model = turn(2, 90.0) @ UP  # along the x axes of the cameras
     for image in before.images.values():
         up = image.cam_from_world().rotation.matrix() @ up_in_model
-        lines = lines_that_say(up, down=(-1.0, 0.0))
-        store.write(image.name, LocalFeatures.empty(8), SIZE, lines=lines)
+        store.write(
+            image.name,
+            LocalFeatures.empty(8),
+            SIZE,
+            lines=lines_that_say(up, down=(-1.0, 0.0)),
+        )
     export(tmp_path / "run" / "sparse" / "0", tmp_path / "out", "text")
     after = exported(tmp_path / "out")
     old = before.images[1].cam_from_world().rotation.matrix()

@@ -25,6 +25,7 @@ from colmap_affrect.mappers.camera_priors import (
     camera_prior,
     usual_principal_point,
 )
+from colmap_affrect.mappers.tie_points import TiePoints
 
 TRUE_FOCAL = 1280.0
 SIZE = (1024, 768)
@@ -220,3 +221,64 @@ def test_a_model_that_is_only_compared_has_the_cost_of_a_converged_one(
             camera.params = [1.1 * camera.params[0], *camera.params[1:3], 0.0]
         costs.append(adjuster.adjust(trial, FINAL))
     assert costs[0] <= costs[1] < costs[0] + 0.5
+
+
+def test_distortion_has_its_prior_where_the_focal_length_is_given(
+    model: pycolmap.Reconstruction,
+) -> None:
+    """Else noisy keypoints of few points bend the lens."""
+    trial = pycolmap.Reconstruction(model)
+    priors = dict.fromkeys(model.cameras, CameraPrior(TRUE_FOCAL, 0.0))
+    Adjuster(priors, 5.0, pycolmap.BundleAdjustmentOptions()).adjust(trial, FINAL)
+    cameras = trial.cameras.values()
+    assert [camera.params[0] for camera in cameras] == [TRUE_FOCAL] * len(cameras)
+    assert max(abs(camera.params[3]) for camera in cameras) < 0.02
+
+
+@pytest.mark.parametrize("num_images", [2, 3])
+def test_tie_points_are_adjusted_also_where_tracks_of_two_images_are_left_out(
+    tmp_path: Path, num_images: int
+) -> None:
+    truth = synthesize(tmp_path / "database.db", num_rigs=4, num_points3D=200)
+    place = np.array([0.1, 0.2, 0.1])
+    keypoints = {}
+    for image_id in sorted(truth.reg_image_ids())[:num_images]:
+        image = truth.images[image_id]
+        keypoints[image_id] = image.num_points2D()
+        image.points2D.append(pycolmap.Point2D(image.project_point(place)))
+    tie_points = TiePoints({"p": keypoints})
+    tie_points.observe(truth)
+    (first, *_) = tie_points.observed(truth)
+    truth.points3D[first[2].point3D_id].xyz = place + np.array([0.05, 0.0, 0.0])
+    priors = dict.fromkeys(truth.cameras, CameraPrior(TRUE_FOCAL, 0.1))
+    adjuster = Adjuster(
+        priors, 0.5, pycolmap.BundleAdjustmentOptions(), tie_points=tie_points
+    )
+    assert adjuster._options(truth, ()).min_track_length == 3
+    adjuster.adjust(truth, FINAL)
+    residuals = tie_points.residuals(truth)
+    assert len(residuals) == num_images
+    assert max(residual.error_px for residual in residuals) < 0.01
+
+
+def test_a_tie_point_of_an_image_that_is_not_adjusted_stays_where_it_is(
+    tmp_path: Path,
+) -> None:
+    truth = synthesize(tmp_path / "database.db", num_rigs=4, num_points3D=200)
+    keypoints = {}
+    first, second, *_ = sorted(truth.reg_image_ids())
+    for image_id in (first, second):
+        image = truth.images[image_id]
+        keypoints[image_id] = image.num_points2D()
+        image.points2D.append(pycolmap.Point2D(image.project_point(np.zeros(3))))
+    tie_points = TiePoints({"p": keypoints})
+    tie_points.observe(truth)
+    (mark, *_) = tie_points.observed(truth)
+    moved = np.array([0.05, 0.0, 0.0])
+    truth.points3D[mark[2].point3D_id].xyz = moved
+    priors = dict.fromkeys(truth.cameras, CameraPrior(TRUE_FOCAL, 0.1))
+    adjuster = Adjuster(
+        priors, 0.5, pycolmap.BundleAdjustmentOptions(), tie_points=tie_points
+    )
+    adjuster.adjust(truth, FINAL, [first])
+    assert truth.points3D[mark[2].point3D_id].xyz.tolist() == moved.tolist()

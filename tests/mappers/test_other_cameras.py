@@ -11,12 +11,13 @@ import pytest
 from mapping_tasks import mapper_of, synthesize
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cameras import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import hypotheses
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
-from colmap_affrect.mappers.own_cameras import one_camera
+from colmap_affrect.mappers.own_cameras import one_camera, with_per_image_cameras
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.reliability_features import features_of
 
@@ -141,3 +142,27 @@ def test_cameras_of_their_own_are_as_likely_as_the_score_pays_for_their_number(
     assert 3.0 < hardly.log_odds < 8.0
     assert hardly.are_shared
     assert hardly.turns_deg == pose_turns_deg(model, shared)
+
+
+def test_pairs_that_a_hypothesis_leaves_out_make_own_cameras_no_less_likely(
+    tmp_path: Path,
+) -> None:
+    """Both models are scored by the same pairs."""
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=4, num_points3D=100, noise_px=0.4)
+    task = task_of(path, truth)
+    mapper = mapper_of("sparse")
+    graph = PairGraph.read(path)
+    native = mapper.native(task, 0)
+    per_image = mapper._search(task, graph, native, lambda _: None)
+    cameras = with_shared_cameras(task.cameras)
+    sharing = replace(task, cameras=cameras)
+    shared = mapper._search(
+        sharing, graph.with_cameras(cameras), native, lambda _: None
+    )
+    model = shared.best(shared.graph)[0].reconstruction
+    first, second, third, _ = sorted(model.reg_image_ids())
+    some = graph.without({(first, second), (first, third)})
+    found = with_per_image_cameras(per_image, some, shared, model)
+    assert found.other is not None
+    assert abs(found.other.log_odds) < 3.0

@@ -26,11 +26,12 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import Side
 from colmap_affrect.mappers import scored_models
 from colmap_affrect.mappers.base import MappedModel
-from colmap_affrect.mappers.mapping import map_database
+from colmap_affrect.mappers.mapping import map_database, read_models
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import (
     _Motions,
     _motions_of_pair,
-    share_of_motion,
+    share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
 from colmap_affrect.mappers.small_motions import SmallMotion
@@ -104,7 +105,7 @@ def scene(
 
 def share(path: Path, left_of: float, *, repeats: bool = False) -> float:
     model = scene(path, left_of, repeats=repeats)
-    return share_of_motion(model, PairGraph.read(path))
+    return share_moving_as_modelled(model, PairGraph.read(path))
 
 
 def left_part_of_wall(part: float) -> float:
@@ -156,13 +157,19 @@ def test_model_beside_which_as_much_moves_is_not_sure_and_says_so(
 
 def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None:
     path = tmp_path / "still.db"
-    mapped = MappedModel(scene(path, -np.inf), motion_share=0.4)
+    mapped = MappedModel(scene(path, -np.inf), share_as_modelled=0.4)
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE
 
 
-@pytest.mark.parametrize(("change_deg", "is_doubted"), [(9.0, True), (1.0, False)])
+@pytest.mark.parametrize(
+    ("change_deg", "is_doubted"),
+    [
+        (9.0, True),
+        (1.0, False),
+    ],
+)
 def test_a_model_is_as_sure_as_a_small_motion_that_turns_it_is_not_the_scene(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -170,7 +177,11 @@ def test_a_model_is_as_sure_as_a_small_motion_that_turns_it_is_not_the_scene(
     *,
     is_doubted: bool,
 ) -> None:
-    small = SmallMotion(0.6, {"0.jpg": change_deg, "1.jpg": 0.5})
+    changes_deg = {
+        "0.jpg": change_deg,
+        "1.jpg": 0.5,
+    }
+    small = SmallMotion(0.6, changes_deg)
     monkeypatch.setattr(scored_models, "small_motion", lambda _: small)
     path = tmp_path / "still.db"
     found = summary(path, MappedModel(scene(path, -np.inf)))
@@ -180,6 +191,22 @@ def test_a_model_is_as_sure_as_a_small_motion_that_turns_it_is_not_the_scene(
         doubts = {**found.doubtful, **found.unsure}
         assert len(doubts) == NUM_IMAGES
         assert doubts["0.jpg"][0] == Doubt("something_moves", {"percent": 60})
+
+
+@pytest.mark.parametrize("are_shared", [True, False])
+def test_models_that_are_gone_on_from_bring_what_is_not_looked_at_again(
+    tmp_path: Path, *, are_shared: bool
+) -> None:
+    """Own cameras of shared ones are; what cameras hide that were freed, and one camera are not."""
+    path = tmp_path / "still.db"
+    other = OtherCameras(-1.0, {"1.jpg": 3.0}, are_shared=are_shared)
+    summary(
+        path,
+        MappedModel(scene(path, -np.inf), other_cameras=other, share_as_modelled=0.4),
+    )
+    (found,) = read_models(tmp_path / "sparse")
+    assert found.share_as_modelled == 0.4
+    assert found.other_cameras == (other if are_shared else None)
 
 
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 900.0, 800, 600)

@@ -29,10 +29,14 @@ def tried(
     """
     grower = SimpleNamespace(remake=lambda _: APART)
     own: Any = SimpleNamespace(
-        graph=SimpleNamespace(has_rigs=False), grower=lambda _: grower
+        graph=SimpleNamespace(has_rigs=False),
+        grower=lambda _: grower,
     )
     gains = FreedomGains(
-        by_shifts=0.0, by_crops=gain, num_freed=6, num_observations=1000
+        by_shifts=0.0,
+        by_crops=gain,
+        num_freed=6,
+        num_observations=1000,
     )
     monkeypatch.setattr(hypotheses, "with_free_principal_points", lambda *_: "free")
     monkeypatch.setattr(hypotheses, "gains_of_freedom", lambda *_: gains)
@@ -57,7 +61,13 @@ def test_prints_that_seem_to_share_a_camera_get_axes_of_their_own(
     assert not test.best[0].axis_turns_deg  # free axes have none
 
 
-@pytest.mark.parametrize(("gain", "is_better"), [(10.0, True), (500.0, False)])
+@pytest.mark.parametrize(
+    ("gain", "is_better"),
+    [
+        (10.0, True),
+        (500.0, False),
+    ],
+)
 def test_a_shared_camera_stays_where_own_axes_bring_little(
     monkeypatch: pytest.MonkeyPatch, gain: float, *, is_better: bool
 ) -> None:

@@ -12,8 +12,14 @@ from mapping_tasks import mapper_of, synthesize, task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import model_poses, pose_errors, relative_pose
 from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.camera_priors import USUAL_SIGMA, CameraPrior
+from colmap_affrect.mappers.model_score import MIN_SCORE_GAIN, ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph
-from colmap_affrect.mappers.point_joining import BY_POINTS, joined_by_points
+from colmap_affrect.mappers.point_joining import (
+    BY_POINTS,
+    PointJoiner,
+    joined_by_points,
+)
 from colmap_affrect.mappers.search import Search
 
 NUM_IMAGES = 6
@@ -117,3 +123,20 @@ def test_a_model_without_an_image_of_its_own_is_left_as_it_is(
     graph = PairGraph.read(tmp_path / "database.db")
     parts = [part_of(truth, range(4)), part_of(truth, range(1, 3))]
     assert joined_by_points(search_of(tmp_path, graph), parts) == parts
+
+
+def test_an_unusual_lens_of_both_models_speaks_for_no_whole(tmp_path: Path) -> None:
+    """What it costs counts once: it is one camera."""
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=1, num_frames_per_rig=6, num_points3D=120)
+    ids = sorted(truth.reg_image_ids())
+    between = {(one, two) for one in ids[:3] for two in ids[3:]}
+    graph = PairGraph.read(path).without(between)
+    search = search_of(tmp_path, graph)
+    (camera,) = truth.cameras.values()
+    unusual = CameraPrior(camera.mean_focal_length() / 4.0, USUAL_SIGMA)
+    assert unusual.cost_of(camera) > MIN_SCORE_GAIN
+    scorer = ModelScorer(graph, {camera.camera_id: unusual})
+    joiner = PointJoiner(search.grower(graph), scorer)
+    parts = part_of(truth, range(3)), part_of(truth, range(3, NUM_IMAGES))
+    assert not joiner._is_better(truth, *parts)

@@ -142,7 +142,13 @@ def test_axes_off_the_middle_are_found_and_better_rotations_with_them(
         assert np.abs(center_of(image.camera) - true_center).max() < 80.0
 
 
-@pytest.mark.parametrize(("share", "is_off"), [(1.0, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("share", "is_off"),
+    [
+        (1.0, True),
+        (0.0, False),
+    ],
+)
 def test_prints_of_one_size_that_were_cut_in_different_places_share_no_camera(
     tmp_path: Path, share: float, *, is_off: bool
 ) -> None:

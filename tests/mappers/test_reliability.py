@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from colmap_affrect.geometry.parallax import mirrored_share
 from colmap_affrect.mappers import reliability_features
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.camera_priors import CameraPrior
+from colmap_affrect.mappers.camera_priors import EXIF_SIGMA, CameraPrior
 from colmap_affrect.mappers.other_cameras import OtherPose
 from colmap_affrect.mappers.pair_graph import VerifiedPair
 from colmap_affrect.mappers.reliability import TERMS, confidence, score_images
@@ -500,3 +501,18 @@ def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
         "2.jpg"
     ].fitting_focal_px
     assert found == 0.0 if factor == 1.0 else found == pytest.approx(1500.0, rel=0.05)
+
+
+def test_a_focal_length_that_has_left_what_exif_says_costs_by_its_deviation(
+    tmp_path: Path,
+) -> None:
+    mapped, task = scene(tmp_path)
+    name = last(mapped).name
+    before = features_of(mapped, task)[name].log_likelihood_ratio
+    with open_database(task.database_path) as database:
+        camera = database.read_camera(last(mapped).camera_id)
+        camera.params = [1.1 * camera.params[0], *camera.params[1:]]
+        database.update_camera(camera)
+    moved = features_of(mapped, replace(task, graphs={}))[name].log_likelihood_ratio
+    expected = 0.5 * (math.log(1.1) / EXIF_SIGMA) ** 2
+    assert before - moved == pytest.approx(expected, rel=1e-3)

@@ -378,7 +378,7 @@ class RisingSearch(Search):
         assert self.model is not None
         self.built_bridges.append(search.builds_bridges)
         found = [MappedModel(pycolmap.Reconstruction(self.model))]
-        return _Attempt(found, float(len(self.built_bridges)), agrees=True)
+        return _Attempt(found, float(len(self.built_bridges)), focals_agree=True)
 
 
 def without_last(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -398,6 +398,20 @@ def test_focal_lengths_that_win_without_bridges_are_tried_with_them(
     search = unknown_search(scene, RisingSearch, model=model)
     search.best(search.graph)  # no bridge is missing
     assert search.built_bridges == [True] + [False] * (len(ZOOMS) - 1)
+
+
+def test_a_search_without_bridges_keeps_models_of_other_images(
+    scene: Scene, model: pycolmap.Reconstruction
+) -> None:
+    models = []
+    ids = sorted(model.reg_image_ids())
+    for lost in (ids[2:], ids[:2], ids[:3]):
+        part = pycolmap.Reconstruction(model)
+        for image_id in lost:
+            part.deregister_frame(part.images[image_id].frame_id)
+        models.append(MappedModel(part))
+    search = unknown_search(scene, Search, builds_bridges=False)
+    assert search.with_bridges(search.graph, models) == models[:2]
 
 
 def test_a_search_ends_after_as_many_failing_first_pairs_as_colmaps(

@@ -20,7 +20,7 @@ def search_with(shared: CameraPrior) -> Any:
     """Return what a search knows of two cameras; it adjusts with the priors that it returns."""
     unknown = {OWN: WIDE_AND_LONG, SHARED: shared}
     return SimpleNamespace(
-        unknown=unknown,
+        unknown_priors=unknown,
         adjuster=SimpleNamespace(priors=unknown),
         _shared={SHARED},
         _adjusting_with=lambda priors: priors,
@@ -58,4 +58,4 @@ def test_bridges_are_right_where_focal_lengths_moved_by_three_hundredths(
     focal_px: float, *, agrees: bool
 ) -> None:
     focals_px: Any = {OWN: focal_px, SHARED: 1200.0}
-    assert Search._agrees(search_with(TWO_STARTS), focals_px) == agrees
+    assert Search._focals_agree(search_with(TWO_STARTS), focals_px) == agrees

@@ -8,9 +8,17 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
 from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.mapping import read_summary, write_summary
+from colmap_affrect.mappers.mapping import (
+    Findings,
+    copy_with_keypoints,
+    read_models,
+    read_summary,
+    write_summary,
+)
+from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import (
     Bridge,
@@ -81,3 +89,23 @@ def test_a_damaged_summary_is_one_clear_line(folder: Path, content: str) -> None
     ):
         read_summary(folder)
     assert read_given_model(folder).num_points3D() == 20
+
+
+def test_a_copy_with_more_keypoints_keeps_what_mapping_goes_on_with(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "sparse" / "0"
+    path.mkdir(parents=True)
+    options = pycolmap.SyntheticDatasetOptions(num_points3D=20)
+    with open_database(tmp_path / "database.db") as database:
+        pycolmap.synthesize_dataset(options, database).write(path)
+    other = OtherCameras(1.5, {"a.jpg": 7.0}, are_shared=True)
+    write_summary(MODEL, path, Findings(other, 0.4))
+    copied = tmp_path / "copied" / "0"
+    copied.parent.mkdir()
+    copy_with_keypoints(path, copied, tmp_path / "database.db")
+    for folder in (path.parent, copied.parent):
+        (found,) = read_models(folder)
+        assert found.reconstruction.num_points3D() == 20
+        assert (found.bridges, found.hypotheses) == (MODEL.bridges, MODEL.hypotheses)
+        assert (found.other_cameras, found.share_as_modelled) == (other, 0.4)

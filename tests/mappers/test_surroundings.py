@@ -241,7 +241,7 @@ def test_places_are_mapped_again_each_by_its_own_pairs_and_without_a_collage(
     assert asked == [{*THERE}, {1, 2}]
     images = [set(mapped.reconstruction.reg_image_ids()) for mapped in found]
     assert images == asked
-    why_not = {name: doubt.code for name, doubt in found[0].apart.items()}
+    why_not = {name: doubt.code for name, doubt in found[0].why_apart.items()}
     assert why_not == {
         "0.jpg": "other_surroundings",
         "1.jpg": "other_surroundings",

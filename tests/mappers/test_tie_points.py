@@ -116,3 +116,15 @@ def test_points_tell_the_depth_of_a_mark_up_to_a_tenth_of_the_image(
 ) -> None:
     model, tie_points = model_around_mark(distance_px)
     assert ("p" in tie_points.positions(model)) == is_known
+
+
+def test_a_mark_without_points_around_is_as_deep_as_another_photograph_says() -> None:
+    """Their rays meet behind both cameras."""
+    model, _ = model_around_mark(60.0)
+    to_the_right = np.array([[200.0, 0.0]])
+    blind = pycolmap.Image("2.jpg", MARK + to_the_right, 1, 2)
+    beside = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-1.0, 0.0, 0.0]))
+    model.add_image_with_trivial_frame(blind, beside * POSE)
+    last = model.images[1].num_points2D() - 1
+    position = TiePoints({"p": {2: 0, 1: last}}).positions(model)["p"]
+    assert position == pytest.approx(place_at(MARK, sorted(NEAR_DEPTHS)[2]))

@@ -124,3 +124,12 @@ def test_summaries_that_are_damaged_or_of_another_version_do_not_count(
         write_sealed(path, json.dumps(values))
     feature_store._forget_summaries()
     assert known(store) == before
+
+
+def test_the_version_counts_up_when_the_same_features_give_other_summaries() -> None:
+    camera = some_lines(0).findings().camera
+    assert camera is not None
+    values = (camera.focal, camera.focal_sigma, camera.shift, camera.shift_sigma)
+    assert (feature_summary.FORMAT_VERSION, *values) == pytest.approx(
+        (2, 1.109972035, 0.447753075, 1.153226e-4, 0.018682949), rel=1e-6
+    ), "priors of lines have changed: count feature_summary.FORMAT_VERSION up"

@@ -5,41 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from line_scenes import SIZE, chance_edges, turn
+from line_scenes import SIZE, chance_edges, corner_of_walls, draw_wall, pixels, turn
 from numpy.testing import assert_allclose
-from strategies import Array
 
 from colmap_affrect.data import GrayImage, Photograph
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.rectifiers.base import RECTIFIERS, RectifierInputs
-
-FOCAL = 1.0  # longer sides
-TURN = turn(0, -8.0) @ turn(
-    1, 42.0
-)  # columns are right, down and ahead of the building
-
-
-def pixels(points: Array, rotation: Array = TURN) -> Array:
-    """(N, 2) pixel-centre px of (N, 3) points in the frame of the building, its corner at 0."""
-    in_camera = points @ rotation.T + [0.0, 0.0, 6.0]
-    return (
-        FOCAL * SIZE[0] * in_camera[:, :2] / in_camera[:, 2:]
-        + np.array(SIZE) / 2.0
-        - 0.5
-    )
-
-
-def draw_wall(image: GrayImage, along: Array, rotation: Array = TURN) -> None:
-    """Draw windows on a wall that runs from the corner along a direction."""
-    down = np.array([0.0, 1.0, 0.0])
-    for column in range(5):
-        for row in range(4):
-            start = along * (0.3 + 0.55 * column) + down * (0.6 * row - 1.2)
-            corners = [start, start + 0.35 * along, start + 0.35 * along + 0.4 * down,
-                       start + 0.4 * down]  # fmt: skip
-            outline = np.rint(pixels(np.array(corners), rotation)).astype(np.int32)
-            cv2.fillPoly(image, [outline], 40, cv2.LINE_AA)
 
 
 def photograph_of(image: GrayImage) -> Photograph:
@@ -50,10 +22,7 @@ def photograph_of(image: GrayImage) -> Photograph:
 @pytest.fixture(scope="module")
 def corner() -> Photograph:
     """Two walls of a court that meet in the middle."""
-    image = np.full(SIZE[::-1], 200, np.uint8)
-    draw_wall(image, np.array([1.0, 0.0, 0.0]))
-    draw_wall(image, np.array([0.0, 0.0, -1.0]))
-    return photograph_of(image)
+    return photograph_of(corner_of_walls())
 
 
 def test_each_wall_of_a_corner_is_shown_from_the_front(corner: Photograph) -> None:

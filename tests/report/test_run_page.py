@@ -61,6 +61,22 @@ def test_everything_of_the_report_is_told(html: str) -> None:
     assert positions == sorted(positions)
 
 
+def test_each_row_of_a_table_has_a_cell_for_each_heading(html: str) -> None:
+    """Where a page is narrow, cells stand below each other, and say what their headings say."""
+    num_rows = 0
+    for table in re.findall(r"<table.*?</table>", html, re.DOTALL):
+        head, _, body = table.partition("</thead>")
+        headings = re.findall(r"<th [^>]*>(.*?)</th>", head, re.DOTALL)
+        for row in re.findall(r"<tr>(.*?)</tr>", body, re.DOTALL):
+            num_rows += 1
+            cells = re.findall(r"<(?:th|td)\b([^>]*)>", row)
+            assert len(cells) == len(headings), f"cells of a row below {headings}"
+            for cell, heading in zip(cells, headings, strict=True):
+                label = re.search(r'data-label="([^"]*)"', cell)
+                assert label is None or label[1] == heading, f"{cell} below {heading}"
+    assert num_rows > len(NAMES)
+
+
 def test_page_loads_nothing_and_names_are_never_markup(html: str) -> None:
     assert re.findall(r"https?://[^\s\"'<]*", html) == []
     assert "default-src 'none'" in html

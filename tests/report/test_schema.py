@@ -81,8 +81,10 @@ def test_a_report_without_a_part_is_refused(report: RunReport, key: str) -> None
     reason="other versions of pydantic write it with other words",
 )
 def test_the_schema_in_the_documentation_is_the_one_of_the_code() -> None:
-    """Write docs/report.schema.json anew with ``report_schema()`` if it is not."""
-    assert SCHEMA.read_text(encoding="utf-8") == report_schema()
+    is_same = SCHEMA.read_text(encoding="utf-8") == report_schema()
+    assert is_same, (
+        "write what colmap_affrect.report.schema.report_schema() returns to docs/report.schema.json"
+    )
 
 
 def test_contradicted_focal_lengths_are_told_in_the_terminal(report: RunReport) -> None:
