@@ -34,6 +34,7 @@ CHANGE_SIGMA_DEG = 1.7
 """Of the angle between poses by what moves and by the rest: what poses by the rest were off in a
 made-up set, the median (measured)."""
 NEGLIGIBLE = 0.01  # chance of wrong poses by a small motion, which is not told; numeric
+OF_WRONG_CAMERAS = {"focal_contradicted", "principal_point_contradicted"}
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
 (theory)."""
@@ -109,6 +110,8 @@ def _doubt_motion(model: ScoredModel, task: MappingTask) -> None:
         for name in list(model.confidences):
             _doubt(model, name, share, doubt)
         return
+    if _has_wrong_cameras(model):
+        return  # which make points fit badly, too
     small = small_motion(model.mapped.reconstruction)
     if small is None or not small.changes_deg:
         return
@@ -120,6 +123,14 @@ def _doubt_motion(model: ScoredModel, task: MappingTask) -> None:
         doubt = Doubt("something_moves", {"percent": math.floor(100.0 * small.share)})
         for name in list(model.confidences):
             _doubt(model, name, 1.0 - wrong, doubt)
+
+
+def _has_wrong_cameras(model: ScoredModel) -> bool:
+    """Tell whether the points of a model contradict what is given of cameras."""
+    for one in (*model.confidences.values(), *model.taken_out.values()):
+        if any(doubt.code in OF_WRONG_CAMERAS for doubt in one.reasons):
+            return True
+    return bool(model.contradictions)
 
 
 def _doubt_given_principal_points(scored: ScoredModel, task: MappingTask) -> None:
