@@ -1,0 +1,53 @@
+"""What a run advises: codes, and how much work of a person each takes."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from colmap_affrect.options import documented
+
+AdviceCode = Literal[
+    "effort",
+    "focal_length",
+    "lines_contradict",
+    "principal_point",
+    "mapper",
+    "features",
+    "recipe",
+    "weights",
+    "tie_points",
+    "lens",
+    "reject_pair",
+    "masks",
+    "photographs",
+]
+"""Kinds of advice: commands that need nothing else, then what is done by hand on the page of a run
+or known by a person, then photographs that are still to be taken or found."""
+
+BY_HAND: Collection[AdviceCode] = ("tie_points", "lens", "reject_pair", "masks")
+"""Advice whose command needs minutes of a person first."""
+
+
+@documented
+@dataclass(frozen=True)
+class Advice:
+    """What may help."""
+
+    code: AdviceCode
+    """Kind of the advice."""
+    why: str
+    """What it would be good for."""
+    command: str = ""
+    """Command for a shell; empty where none does it."""
+
+    @property
+    def work(self) -> int:
+        """How much a person has to do: 0 nothing but the command, 1 minutes, 2 hours."""
+        if self.code == "photographs":
+            return 2
+        return 1 if self.code in BY_HAND else 0
+
+
+def least_work_first(advised: Iterable[Advice]) -> tuple[Advice, ...]:
+    """Return advice that takes a person less work before other advice, else in its order."""
+    return tuple(sorted(advised, key=lambda one: one.work))
