@@ -65,7 +65,7 @@ def anew(context: Context, *words: str, leave_out: Collection[str] = ()) -> str:
     """
     flags = [word for word in words if word.startswith("--")]
     command = without(_run_command(context), [*flags, *leave_out])
-    return shlex.join([*_beside(context, command), *words])
+    return shlex.join(_beside(context, [*command, *words]))
 
 
 def with_default_mapper(context: Context, *words: str) -> str:
@@ -90,7 +90,7 @@ def with_default_mapper(context: Context, *words: str) -> str:
         if "--from-database" not in command:
             database = str(workspace.database)
             command = ["colmap-affrect", "map", "--from-database", database]
-        return shlex.join([*_beside(context, command), *mapper, *words])
+        return shlex.join(_beside(context, [*command, *mapper, *words]))
     return shlex.join([*command, *mapper, *words, "--overwrite"])
 
 

@@ -105,8 +105,8 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         },
         "doubtful": {}, "unsure": {}, "probabilities": {}, "hypotheses": [], "guided": {},
         "advice": [
-            {"why": "it tries more", "command": "colmap-affrect run"},
-            {"why": "more photographs", "command": ""},
+            {"code": "recipe", "why": "it tries more", "command": "colmap-affrect run"},
+            {"code": "photographs", "why": "more photographs", "command": ""},
         ],
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
