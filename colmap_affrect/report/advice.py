@@ -100,6 +100,17 @@ class _Case:
         """Whether the points of the model contradict a given principal point."""
         return bool(self.model.principal_point_contradictions)
 
+    @property
+    def is_all_unsure(self) -> bool:
+        """Whether no photograph of the model is sure."""
+        return bool(self.model.probabilities) and not self.model.sure
+
+    @property
+    def wants_advice(self) -> bool:
+        """Whether something is missing, doubtful, contradicted, or nothing is sure."""
+        reasons = (self.lost, self.doubts, self.moves, self.is_contradicted)
+        return any(reasons) or self.is_all_unsure
+
     def has_doubt(self, codes: Collection[DoubtCode]) -> bool:
         """Return whether an image is doubted for one of some reasons."""
         return any(doubt.code in codes for doubt in self.doubts)
@@ -163,7 +174,7 @@ def advice(
         why = "more photographs: two that can be read and show the same make a model"
         return (Advice("photographs", why),)
     found = _of_effort(case)
-    if lost or case.doubts or case.moves or case.is_contradicted:
+    if case.wants_advice:
         for rule in RULES:
             found += rule(case)
     return least_work_first(found)
@@ -394,10 +405,12 @@ def _of_masks(case: _Case) -> list[Advice]:
 
 
 def _of_more_photographs(case: _Case) -> list[Advice]:
-    if not case.lost:
+    """Return what helps photographs that are lost or doubtful, and models that are unsure."""
+    needing = case.lost or [*case.model.doubtful]
+    if not (needing or case.is_all_unsure):
         return []
-    why = f"more photographs, between {such_as(case.lost)} and the others"
-    if len(case.lost) == case.num_images:
+    why = f"more photographs, between {such_as(needing)} and the others"
+    if len(needing) in (0, case.num_images):
         why = "more photographs, from places between those of these"
     if not case.models and case.strongest >= ENOUGH:
         why = _why_no_model(case)

@@ -4,12 +4,14 @@ Runs ``colmap-affrect run`` on sets in which something is missing or doubtful, r
 ``report.json``, and gives its commands in a copy of the folder. Usage:
 
     python tests/benchmarks/advice.py --scenes-path ../shared/scenes --sets kitchen:2 nadar \
-        --variants "--recipe rectified" "" --work-path out/advice --output-path out/advice.json
+        --variants "--recipe rectified" "--effort low" --work-path out/advice \
+        --output-path out/advice.json
 
 A set is SCENE, SCENE:STEP or SCENE:STEP:FIRST, or FOLDER/SCENE... for scenes of another folder. A
-variant is what a run is given beside its photographs. Of what a person does, two are imitated: more
+variant is what a run is given beside its photographs; with --finished it begins with copies of
+output folders, one for each set, and goes on there. Of what a person does, two are imitated: more
 photographs are those between the ones of the set, and what is known of a lens is the true focal
-length. What is marked or painted is not tried, it says "by hand". Photographs are right as in
+length. What is marked or painted is not tried. Photographs are right as in
 registration.py; of a set that got more photographs those that it had before count. Prints a table
 and writes every trial as JSON; trials that are in the JSON file are not done again.
 """
@@ -146,13 +148,21 @@ def follow(
     return shlex.split(advised["command"])
 
 
-def trials(chosen: Chosen, variant: str, folder: Path) -> list[Row]:
+def trials(
+    chosen: Chosen,
+    variant: str,
+    folder: Path,
+    finished_path: Path | None,
+    codes: Sequence[str],
+) -> list[Row]:
     """Run a set, and again as each advice says.
 
     Args:
         chosen: the set.
         variant: options of the run.
         folder: for all results.
+        finished_path: output folder to begin with a copy of; None to begin with nothing.
+        codes: kinds of advice to follow; all if empty.
 
     Returns:
         A row for the run itself, and one for each advice.
@@ -161,6 +171,8 @@ def trials(chosen: Chosen, variant: str, folder: Path) -> list[Row]:
     base_path = folder / "base"
     base_path.mkdir(parents=True)
     write_names(chosen, chosen.step, base_path)
+    if finished_path:
+        shutil.copytree(finished_path, base_path / "out")
     images = str((chosen.scene_path / "images").resolve())
     base = [PROGRAM, "run", "--image-path", images, "--image-list-path", "names.txt"]
     base += [*shlex.split(variant), "--quiet", "--output-path", "out"]
@@ -173,6 +185,9 @@ def trials(chosen: Chosen, variant: str, folder: Path) -> list[Row]:
     advice = json.loads(report_path.read_text(encoding="utf-8"))["advice"]
     for number, advised in enumerate(advice):
         row = {key: advised[key] for key in ("code", "why", "command")}
+        rows.append(row)
+        if codes and advised["code"] not in codes:
+            continue
         copy = folder / f"advice-{number}"
         shutil.copytree(base_path, copy)
         words = follow(chosen, advised, base, copy)
@@ -180,7 +195,6 @@ def trials(chosen: Chosen, variant: str, folder: Path) -> list[Row]:
             row["seconds"], row["exit"] = run_command(words, copy)
             if row["exit"] in (0, 3):
                 row |= judged(chosen, output_of(words, copy))
-        rows.append(row)
         print(folder.name, json.dumps(row), flush=True)
     return rows
 
@@ -199,7 +213,7 @@ def table_of(found: dict[str, list[Row]]) -> str:
         for row in after:
             told = counts(row) or "none"
             if "seconds" not in row:
-                told = "by hand"
+                told = "not tried"
             elif row["exit"] not in (0, 3):
                 told = f"exit code {row['exit']}"
             took = f"{row['seconds']:.0f}" if "seconds" in row else "-"
@@ -216,6 +230,10 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", required=True, metavar="SCENE:STEP:FIRST")
     parser.add_argument("--variants", nargs="+", default=[""], metavar="OPTIONS")
     parser.add_argument(
+        "--codes", nargs="+", default=[], help="advice to follow (default: all)"
+    )
+    parser.add_argument("--finished", nargs="+", type=Path, default=[])
+    parser.add_argument(
         "--scenes-path", type=Path, default=root.parent / "shared" / "scenes"
     )
     parser.add_argument(
@@ -225,14 +243,17 @@ def main() -> None:
     arguments = parser.parse_args()
     output_path = arguments.output_path
     found = json.loads(output_path.read_text()) if output_path.exists() else {}
-    for text in arguments.sets:
+    finished: Sequence[Path | None] = arguments.finished or [None] * len(arguments.sets)
+    for text, finished_path in zip(arguments.sets, finished, strict=True):
         for variant in arguments.variants:
             name = f"{text} {variant}"
             if name in found:
                 continue
             folder = arguments.work_path.resolve() / re.sub(r"\W+", "_", name)
             chosen = read_set(text, arguments.scenes_path)
-            found[name] = trials(chosen, variant, folder)
+            found[name] = trials(
+                chosen, variant, folder, finished_path, arguments.codes
+            )
             output_path.write_text(json.dumps(found, indent=1) + "\n")
     print(table_of(found))
 

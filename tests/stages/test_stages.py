@@ -248,7 +248,8 @@ def test_focal_lengths_are_advised_where_they_are_unknown_or_contradicted(
     adviser: Adviser,
 ) -> None:
     unknown = {LOST: (Doubt("focal_unknown"),)}
-    assert adviser.commands([], doubtful=unknown) == [""]  # a number is a guess
+    # A number in a command would be a guess; more photographs have no command either
+    assert adviser.commands([], doubtful=unknown) == ["", ""]
     contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
     found = adviser.commands([LOST], taken_out={LOST: (contradicted,)})
     assert found[0] == adviser.anew("--focal-length-px 8")
@@ -290,16 +291,30 @@ def test_masks_and_rejected_pairs_are_advised_where_matches_contradict_a_pose(
     more = adviser.anew("--recipe default")
     bridged = {LOST: Bridge(NAMES[1], 5, 9, 0.2)}
     little = {LOST: (Doubt("little_agreement", {"percent": 9}),)}
-    assert adviser.commands([], doubtful=little, gains={LOST: 0.3}) == [more, masks]
+    assert adviser.commands([], doubtful=little, gains={LOST: 0.3}) == [more, masks, ""]
     rejecting = f"{AGAIN} --reject-pair '{LOST},{NAMES[1]}'"
     agreeing = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
-    assert agreeing == [masks]  # the model says that these matches are right
+    assert agreeing == [masks, ""]  # the model says that these matches are right
     disagrees = {(NAMES[1], LOST): 0.4}
     monkeypatch.setattr(advice_module, "agreements", lambda *_: disagrees)
     found = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
-    assert found == [rejecting, masks]
+    assert found == [rejecting, masks, ""]
     few = {LOST: (Doubt("few_matches"),)}
-    assert adviser.commands([], doubtful=few, bridges=bridged) == []
+    assert adviser.commands([], doubtful=few, bridges=bridged) == [""]
+
+
+def test_more_photographs_help_doubtful_ones_and_models_of_which_nothing_is_sure(
+    adviser: Adviser,
+) -> None:
+    few = {LOST: (Doubt("few_matches"),)}
+    doubtful = replace(adviser.model, doubtful=few, gains={})
+    (found,) = advice(adviser.context, [], [doubtful], 0)
+    assert found.why == f"more photographs, between {LOST} and the others"
+    unsure = replace(adviser.model, probabilities=dict.fromkeys(NAMES, 0.7))
+    (found,) = advice(adviser.context, [], [unsure], 0)
+    assert found.why == "more photographs, from places between those of these"
+    one_sure = replace(unsure, probabilities={**unsure.probabilities, LOST: 0.97})
+    assert advice(adviser.context, [], [one_sure], 0) == ()
 
 
 def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
@@ -364,7 +379,6 @@ def test_the_default_mapper_is_advised_first_where_another_one_leaves_out(
     first, *_ = other.commands([LOST])
     assert first == other.anew("").replace("  ", " ")
     assert "" in other.commands([LOST])  # more photographs
-    assert other.commands([]) == []
     marks = advice_module.command_with_tie_points(asked)
     assert marks == other.anew("--tie-points tie-points.csv")
 
