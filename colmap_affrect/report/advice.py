@@ -331,7 +331,10 @@ def _of_other_features(case: _Case) -> list[Advice]:
     workspace = context.workspace
     if workspace.is_foreign:
         command = anew(context, "--from-database", str(workspace.database))
-        return [Advice("features", "make new features for its images", command)]
+        why = "make new features for its images"
+        if not workspace.photographs():
+            why += ", which are in a folder photos"
+        return [Advice("features", why, command)]
     names = such_as(helped)
     if workspace.recipe() != STRONGEST:
         why = f"recipe {STRONGEST} tries more for {names}"
@@ -412,7 +415,8 @@ def _of_more_photographs(case: _Case) -> list[Advice]:
     why = f"more photographs, between {such_as(needing)} and the others"
     if len(needing) in (0, case.num_images):
         why = "more photographs, from places between those of these"
-    if not case.models and case.strongest >= ENOUGH:
+    is_ours = case.context.mapping.name == MAPPERS.default  # others do not tell
+    if not case.models and case.strongest >= ENOUGH and is_ours:
         why = _why_no_model(case)
     return [Advice("photographs", why)]
 

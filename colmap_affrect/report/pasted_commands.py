@@ -2,13 +2,25 @@
 
 import itertools
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.session.context import Context
+from colmap_affrect.session.context import Context, Inputs
 
 MAPPER_FLAGS: Collection[str] = ("--mapper", "--mapper-options")
+CAMERA_FLAGS: Mapping[str, str] = {
+    "mode": "--camera-mode",
+    "model": "--camera-model",
+    "params": "--camera-params",
+    "cameras_path": "--cameras-path",
+    "focal_length_px": "--focal-length-px",
+    "focal_mm": "--focal-mm",
+    "film_width_mm": "--film-width-mm",
+    "principal_point": "--principal-point",
+}
+"""By the names of ``CameraOptions``; each has a value."""
 
 
 def again(context: Context, *words: str) -> str:
@@ -105,9 +117,31 @@ def _beside(context: Context, command: Sequence[str]) -> list[str]:
 
 
 def _run_command(context: Context) -> Sequence[str]:
-    """Return the words of the command that ran all stages, or the usual ones."""
+    """Return the words of the command that ran all stages, or those of one for the same inputs."""
     if context.command[1:2] == ("run",):
         return context.command
     workspace = context.workspace
     photos = str(workspace.photographs() or Path("photos"))
-    return ("colmap-affrect", "run", "--image-path", photos)
+    command = ["colmap-affrect", "run", "--image-path", photos]
+    if workspace.is_foreign:
+        return command
+    return [*command, *_input_flags(context.inputs)]
+
+
+def _input_flags(inputs: Inputs) -> list[str]:
+    """Return flags that say of photographs and cameras what is on record, with their values."""
+    values = {
+        "--image-list-path": inputs.image_list_path,
+        "--from-database": inputs.from_database,
+        "--mask-path": inputs.masks.path,
+        "--camera-mask-path": inputs.masks.camera_path,
+    }
+    usual = CameraOptions()
+    for name, flag in CAMERA_FLAGS.items():
+        value = getattr(inputs.cameras, name)
+        values[flag] = f"{value}" if value != getattr(usual, name) else ""
+    flags = list[str]()
+    for flag, text in values.items():
+        if text:
+            flags += [flag, text]
+    return [*flags, "--ignore-exif"] if inputs.cameras.ignore_exif else flags

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from colmap_affrect.cli.parser import build_parser
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.project.advised import Advice, least_work_first
 from colmap_affrect.report.pasted_commands import (
     again,
@@ -17,6 +18,7 @@ from colmap_affrect.report.pasted_commands import (
     with_default_mapper,
     without,
 )
+from colmap_affrect.session.context import Inputs
 
 
 def context_of(command: str, *, is_foreign: bool = False) -> Any:
@@ -27,7 +29,9 @@ def context_of(command: str, *, is_foreign: bool = False) -> Any:
         database=Path("out/database.db"),
         photographs=lambda: Path("photos"),
     )
-    return SimpleNamespace(workspace=workspace, command=tuple(shlex.split(command)))
+    words = tuple(shlex.split(command))
+    inputs = Inputs(image_path="photos")
+    return SimpleNamespace(workspace=workspace, command=words, inputs=inputs)
 
 
 def parsed(command: str) -> Any:
@@ -95,6 +99,25 @@ def test_the_default_mapper_takes_the_place_of_another_one(
     found = with_default_mapper(context)
     assert found == f"colmap-affrect {expected}"
     assert parsed(found).mapper in (None, "sparse")
+
+
+def test_a_run_by_stages_is_run_anew_with_all_that_is_known_of_its_photographs() -> (
+    None
+):
+    context = context_of("colmap-affrect map --output-path out")
+    cameras = CameraOptions(
+        mode="single", params="-1,2", focal_mm=50.0, ignore_exif=True
+    )
+    masks = MaskOptions(path="masks", camera_path="mask.png")
+    context.inputs = Inputs(
+        image_path="photos", image_list_path="a b", cameras=cameras, masks=masks
+    )
+    found = parsed(anew(context, "--recipe", "default"))
+    assert getattr(found, "cameras.params") == "-1,2"
+    assert getattr(found, "cameras.focal_mm") == 50.0
+    assert getattr(found, "cameras.ignore_exif")
+    assert found.image_list_path == Path("a b")
+    assert found.recipe == "default"
 
 
 def test_what_takes_a_person_less_work_is_advised_first() -> None:
