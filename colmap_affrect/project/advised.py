@@ -1,6 +1,6 @@
 """What a run advises: codes, and how much work of a person each takes."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,6 +27,10 @@ or known by a person, then photographs that are still to be taken or found."""
 BY_HAND: Collection[AdviceCode] = ("tie_points", "lens", "reject_pair", "masks")
 """Advice whose command needs minutes of a person first."""
 
+Work = Literal["nothing", "minutes", "hours"]
+WORKS: Sequence[Work] = ("nothing", "minutes", "hours")
+"""What a person has to do beside giving a command, the least first."""
+
 
 @documented
 @dataclass(frozen=True)
@@ -41,13 +45,13 @@ class Advice:
     """Command for a shell; empty where none does it."""
 
     @property
-    def work(self) -> int:
-        """How much a person has to do: 0 nothing but the command, 1 minutes, 2 hours."""
+    def work(self) -> Work:
+        """What a person has to do beside giving the command."""
         if self.code == "photographs":
-            return 2
-        return 1 if self.code in BY_HAND else 0
+            return "hours"
+        return "minutes" if self.code in BY_HAND else "nothing"
 
 
 def least_work_first(advised: Iterable[Advice]) -> tuple[Advice, ...]:
     """Return advice that takes a person less work before other advice, else in its order."""
-    return tuple(sorted(advised, key=lambda one: one.work))
+    return tuple(sorted(advised, key=lambda one: WORKS.index(one.work)))
