@@ -173,11 +173,12 @@ def advice(
     if (missing or case.doubts) and num_usable < 2:
         why = "more photographs: two that can be read and show the same make a model"
         return (Advice("photographs", why),)
-    found = _of_effort(case)
+    found = list[Advice]()
     if case.wants_advice:
         for rule in RULES:
             found += rule(case)
-    return least_work_first(found)
+    # Measured: what the default effort leaves out brought nothing, see docs/troubleshooting.md
+    return least_work_first([*found, *_of_effort(case)])
 
 
 def command_with_tie_points(context: Context) -> str:
