@@ -7,7 +7,6 @@ from typing import Literal
 from colmap_affrect.options import documented
 
 AdviceCode = Literal[
-    "effort",
     "focal_length",
     "lines_contradict",
     "principal_point",
@@ -15,16 +14,17 @@ AdviceCode = Literal[
     "features",
     "recipe",
     "weights",
+    "effort",
     "tie_points",
     "lens",
-    "reject_pair",
     "masks",
+    "reject_pair",
     "photographs",
 ]
 """Kinds of advice: commands that need nothing else, then what is done by hand on the page of a run
 or known by a person, then photographs that are still to be taken or found."""
 
-BY_HAND: Collection[AdviceCode] = ("tie_points", "lens", "reject_pair", "masks")
+BY_HAND: Collection[AdviceCode] = ("tie_points", "lens", "masks", "reject_pair")
 """Advice whose command needs minutes of a person first."""
 
 Work = Literal["nothing", "minutes", "hours"]

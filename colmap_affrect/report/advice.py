@@ -363,6 +363,27 @@ def _of_tie_points(case: _Case) -> list[Advice]:
     return [Advice("tie_points", why, command)]
 
 
+def _of_unknown_focal(case: _Case) -> list[Advice]:
+    """Return advice without a command: a focal length that stands in one would be a guess."""
+    if not (case.may_change_cameras and case.has_doubt(["focal_unknown"])):
+        return []
+    why = (
+        "give lens and film, plate or sensor if you know them, by --focal-mm and "
+        "--film-width-mm: a guess misleads"
+    )
+    return [Advice("lens", why)]
+
+
+def _of_masks(case: _Case) -> list[Advice]:
+    inputs = case.inputs
+    if not (inputs and inputs.masks == MaskOptions()):
+        return []
+    if not (case.moves or case.has_doubt(CONTRADICTED)):
+        return []
+    why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
+    return [Advice("masks", why, command_with_masks(case.context))]
+
+
 def _of_bridges(case: _Case) -> list[Advice]:
     """Return commands without pairs that brought doubtful images in and that disagree now."""
     bridged = list[Pair]()
@@ -387,27 +408,6 @@ def _of_bridges(case: _Case) -> list[Advice]:
     return found
 
 
-def _of_unknown_focal(case: _Case) -> list[Advice]:
-    """Return advice without a command: a focal length that stands in one would be a guess."""
-    if not (case.may_change_cameras and case.has_doubt(["focal_unknown"])):
-        return []
-    why = (
-        "give lens and film, plate or sensor if you know them, by --focal-mm and "
-        "--film-width-mm: a guess misleads"
-    )
-    return [Advice("lens", why)]
-
-
-def _of_masks(case: _Case) -> list[Advice]:
-    inputs = case.inputs
-    if not (inputs and inputs.masks == MaskOptions()):
-        return []
-    if not (case.moves or case.has_doubt(CONTRADICTED)):
-        return []
-    why = "mask what moves, repeats or is written on photographs (black, in a folder masks)"
-    return [Advice("masks", why, command_with_masks(case.context))]
-
-
 def _of_more_photographs(case: _Case) -> list[Advice]:
     """Return what helps photographs that are lost or doubtful, and models that are unsure."""
     needing = case.lost or [*case.model.doubtful]
@@ -429,9 +429,9 @@ RULES: Sequence[Callable[[_Case], list[Advice]]] = (
     _of_mapper,
     _of_other_features,
     _of_tie_points,
-    _of_bridges,
     _of_unknown_focal,
     _of_masks,
+    _of_bridges,
     _of_more_photographs,
 )
 

@@ -7,13 +7,14 @@ Runs ``colmap-affrect run`` on sets in which something is missing or doubtful, r
         --variants "--recipe rectified" "--effort low" --work-path out/advice \
         --output-path out/advice.json
 
-A set is SCENE, SCENE:STEP or SCENE:STEP:FIRST, or FOLDER/SCENE... for scenes of another folder. A
-variant is what a run is given beside its photographs; with --finished it begins with copies of
-output folders, one for each set, and goes on there. Of what a person does, two are imitated: more
-photographs are those between the ones of the set, and what is known of a lens is the true focal
-length. What is marked or painted is not tried. Photographs are right as in
-registration.py; of a set that got more photographs those that it had before count. Prints a table
-and writes every trial as JSON; trials that are in the JSON file are not done again.
+A set is SCENE, SCENE:STEP or SCENE:STEP:FIRST. A variant is what a run is given beside its
+photographs; with --finished it begins with copies of output folders, one for each set, and goes on
+there. Of what a person does, three things are imitated: more photographs are those between the ones
+of the set, what is known of a lens is the true focal length, and tie points are points of --marked,
+a model of all photographs for each set, clicked with an error of a pixel. What is painted or looked
+at is not tried. Photographs are right as in registration.py; of a set that got more photographs
+those that it had before count. Prints a table and writes every trial as JSON; trials that are in
+the JSON file are not done again.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from machine import parser_of, table
 from whole_run import TRUTHS
 
@@ -39,6 +41,8 @@ from colmap_affrect.comparison.results import pose_scores
 Row = dict[str, Any]
 PROGRAM = "colmap-affrect"
 FILM_WIDTH_MM = 36.0
+NUM_MARKED = 12  # tie points of a lost photograph
+CLICK_ERROR_PX = 1.0
 COUNTED = ("right", "registered", "sure", "sure_and_wrong")
 HEADER = ("set", "variant", "advice", "before", "after", "seconds")
 
@@ -123,6 +127,37 @@ def true_lens(chosen: Chosen) -> list[str]:
     return ["--focal-mm", f"{focal_mm:.2f}", "--film-width-mm", f"{FILM_WIDTH_MM:g}"]
 
 
+def write_marks(model_path: Path, report: Row, folder: Path) -> None:
+    """Mark points of a model of all photographs in lost ones and in two or more that are placed.
+
+    Args:
+        model_path: of that model.
+        report: of the run.
+        folder: for ``tie-points.csv``.
+    """
+    model = pycolmap.Reconstruction(model_path)
+    random = np.random.default_rng(0)
+    placed = set(report["registered_names"])
+    wanted = dict.fromkeys(report["unregistered"], NUM_MARKED)
+    rows = []
+    for number, point in sorted(model.points3D.items()):
+        seen = {}
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen[image.name] = image.points2D[element.point2D_idx].xy
+        lost = [name for name in seen if wanted.get(name)]
+        shown = {name: xy for name, xy in seen.items() if name in {*placed, *lost}}
+        if not lost or len(placed & shown.keys()) < 2:
+            continue
+        for name in lost:
+            wanted[name] -= 1
+        for name, xy in shown.items():
+            x, y = xy + random.normal(0.0, CLICK_ERROR_PX, 2)
+            rows.append(f"{number},{name},{x:.1f},{y:.1f}\n")
+    text = "point,photograph,x,y\n" + "".join(rows)
+    (folder / "tie-points.csv").write_text(text, encoding="utf-8")
+
+
 def follow(
     chosen: Chosen, advised: Row, base: Sequence[str], folder: Path
 ) -> list[str]:
@@ -143,7 +178,8 @@ def follow(
     if code == "lens":
         lens = true_lens(chosen)
         return [*base[:-1], "with-lens", *lens] if lens else []
-    if code in ("tie_points", "masks", "weights"):
+    is_marked = (folder / "tie-points.csv").exists()
+    if code in ("masks", "weights") or (code == "tie_points" and not is_marked):
         return []
     return shlex.split(advised["command"])
 
@@ -153,6 +189,7 @@ def trials(
     variant: str,
     folder: Path,
     finished_path: Path | None,
+    marked_path: Path | None,
     codes: Sequence[str],
 ) -> list[Row]:
     """Run a set, and again as each advice says.
@@ -162,6 +199,7 @@ def trials(
         variant: options of the run.
         folder: for all results.
         finished_path: output folder to begin with a copy of; None to begin with nothing.
+        marked_path: model of all photographs, whose points are marked; None to mark none.
         codes: kinds of advice to follow; all if empty.
 
     Returns:
@@ -182,8 +220,10 @@ def trials(
     if not report_path.exists():
         return [{"code": "run", "exit": code}]
     rows = [{"code": "run", "seconds": seconds, **judged(chosen, output_path)}]
-    advice = json.loads(report_path.read_text(encoding="utf-8"))["advice"]
-    for number, advised in enumerate(advice):
+    report = json.loads(report_path.read_text(encoding="utf-8"))
+    if marked_path:
+        write_marks(marked_path, report, base_path)
+    for number, advised in enumerate(report["advice"]):
         row = {key: advised[key] for key in ("code", "why", "command")}
         rows.append(row)
         if codes and advised["code"] not in codes:
@@ -233,6 +273,7 @@ def main() -> None:
         "--codes", nargs="+", default=[], help="advice to follow (default: all)"
     )
     parser.add_argument("--finished", nargs="+", type=Path, default=[])
+    parser.add_argument("--marked", nargs="+", type=Path, default=[])
     parser.add_argument(
         "--scenes-path", type=Path, default=root.parent / "shared" / "scenes"
     )
@@ -243,8 +284,12 @@ def main() -> None:
     arguments = parser.parse_args()
     output_path = arguments.output_path
     found = json.loads(output_path.read_text()) if output_path.exists() else {}
-    finished: Sequence[Path | None] = arguments.finished or [None] * len(arguments.sets)
-    for text, finished_path in zip(arguments.sets, finished, strict=True):
+    none = [None] * len(arguments.sets)
+    finished = arguments.finished or none
+    marked = arguments.marked or none
+    for text, finished_path, marked_path in zip(
+        arguments.sets, finished, marked, strict=True
+    ):
         for variant in arguments.variants:
             name = f"{text} {variant}"
             if name in found:
@@ -252,7 +297,7 @@ def main() -> None:
             folder = arguments.work_path.resolve() / re.sub(r"\W+", "_", name)
             chosen = read_set(text, arguments.scenes_path)
             found[name] = trials(
-                chosen, variant, folder, finished_path, arguments.codes
+                chosen, variant, folder, finished_path, marked_path, arguments.codes
             )
             output_path.write_text(json.dumps(found, indent=1) + "\n")
     print(table_of(found))

@@ -298,7 +298,7 @@ def test_masks_and_rejected_pairs_are_advised_where_matches_contradict_a_pose(
     disagrees = {(NAMES[1], LOST): 0.4}
     monkeypatch.setattr(advice_module, "agreements", lambda *_: disagrees)
     found = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
-    assert found == [rejecting, masks, ""]
+    assert found == [masks, rejecting, ""]
     few = {LOST: (Doubt("few_matches"),)}
     assert adviser.commands([], doubtful=few, bridges=bridged) == [""]
 
