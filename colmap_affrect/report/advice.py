@@ -350,13 +350,18 @@ def _of_other_features(case: _Case) -> list[Advice]:
 def _of_tie_points(case: _Case) -> list[Advice]:
     context = case.context
     is_ours = context.mapping.name == MAPPERS.default
-    if not (case.lost and len(case.model.likely) > 1 and is_ours):
+    if not (case.lost and is_ours) or case.shows_no_depth:
         return []
     table = context.by_hand.tie_points_path
-    why = f"mark six points or more of {such_as(case.lost)}"
-    why += " in two photographs of the model too, at Tie points by hand in report.html"
-    if len(case.models) > 1:
-        why += "; seven, each in two photographs of both, join two models"
+    place = "at Tie points by hand in report.html"
+    if len(case.model.likely) > 1:
+        why = f"mark six points or more of {such_as(case.lost)}"
+        why += f" in two photographs of the model too, {place}"
+        if len(case.models) > 1:
+            why += "; seven, each in two photographs of both, join two models"
+    else:
+        why = "mark seven points or more in two photographs, which begin a model, and six of these "
+        why += f"in others, {place}"
     if table and not any(model.tie_points for model in case.models):
         why = f"no point of {table.name} is seen by two photographs of one model: {why}"
     command = again(context, "--tie-points", str(table or "tie-points.csv"))

@@ -130,6 +130,8 @@ def true_lens(chosen: Chosen) -> list[str]:
 def write_marks(model_path: Path, report: Row, folder: Path) -> None:
     """Mark points of a model of all photographs in lost ones and in two or more that are placed.
 
+    Where not even two are placed and not doubtful, points in any three photographs are marked.
+
     Args:
         model_path: of that model.
         report: of the run.
@@ -139,6 +141,8 @@ def write_marks(model_path: Path, report: Row, folder: Path) -> None:
     random = np.random.default_rng(0)
     placed = set(report["registered_names"])
     wanted = dict.fromkeys(report["unregistered"], NUM_MARKED)
+    likely = placed - report["doubtful"].keys()
+    needed, num_needed = (placed, 2) if len(likely) > 1 else ({*placed, *wanted}, 3)
     rows = []
     for number, point in sorted(model.points3D.items()):
         seen = {}
@@ -147,7 +151,7 @@ def write_marks(model_path: Path, report: Row, folder: Path) -> None:
             seen[image.name] = image.points2D[element.point2D_idx].xy
         lost = [name for name in seen if wanted.get(name)]
         shown = {name: xy for name, xy in seen.items() if name in {*placed, *lost}}
-        if not lost or len(placed & shown.keys()) < 2:
+        if not lost or len(needed & shown.keys()) < num_needed:
             continue
         for name in lost:
             wanted[name] -= 1

@@ -333,6 +333,14 @@ def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
 
 
+def test_tie_points_that_begin_a_model_are_advised_where_there_is_none(
+    adviser: Adviser,
+) -> None:
+    (_, tie_points, _) = advice(adviser.context, [*NAMES], [], 0)
+    assert tie_points.code == "tie_points"
+    assert tie_points.why.startswith("mark seven points or more in two photographs")
+
+
 @pytest.mark.parametrize(
     ("shows_depth", "why"),
     [(True, "contradict each other"), (False, "show no depth")],
@@ -349,11 +357,12 @@ def test_strong_pairs_that_make_no_model_contradict_each_other_or_show_no_depth(
     *more, found = advice(adviser.context, [*NAMES], [], 900)
     assert why in found.why
     # Other features show no depth either where there is none
-    assert [one.code for one in more] == ["recipe"] * shows_depth
+    codes = ["recipe", "tie_points"] if shows_depth else []
+    assert [one.code for one in more] == codes
 
 
 def test_matches_of_a_scene_with_depth_show_it(adviser: Adviser) -> None:
-    (_, found) = advice(adviser.context, [*NAMES], [], 900)
+    *_, found = advice(adviser.context, [*NAMES], [], 900)
     assert "contradict each other" in found.why
 
 
