@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from machine import parser_of, table
+from numpy.typing import NDArray
 from whole_run import TRUTHS
 
 from colmap_affrect.colmap import pycolmap
@@ -127,6 +128,19 @@ def true_lens(chosen: Chosen) -> list[str]:
     return ["--focal-mm", f"{focal_mm:.2f}", "--film-width-mm", f"{FILM_WIDTH_MM:g}"]
 
 
+def points_seen(model_path: Path) -> dict[int, dict[str, NDArray[np.float64]]]:
+    """Return where each point of a model is seen, in px, by photograph."""
+    model = pycolmap.Reconstruction(model_path)
+    found = {}
+    for number, point in sorted(model.points3D.items()):
+        seen = {}
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen[image.name] = image.points2D[element.point2D_idx].xy
+        found[number] = seen
+    return found
+
+
 def write_marks(model_path: Path, report: Row, folder: Path) -> None:
     """Mark points of a model of all photographs in lost ones and in two or more that are placed.
 
@@ -137,25 +151,19 @@ def write_marks(model_path: Path, report: Row, folder: Path) -> None:
         report: of the run.
         folder: for ``tie-points.csv``.
     """
-    model = pycolmap.Reconstruction(model_path)
     random = np.random.default_rng(0)
     placed = set(report["registered_names"])
     wanted = dict.fromkeys(report["unregistered"], NUM_MARKED)
     likely = placed - report["doubtful"].keys()
     needed, num_needed = (placed, 2) if len(likely) > 1 else ({*placed, *wanted}, 3)
     rows = []
-    for number, point in sorted(model.points3D.items()):
-        seen = {}
-        for element in point.track.elements:
-            image = model.images[element.image_id]
-            seen[image.name] = image.points2D[element.point2D_idx].xy
-        lost = [name for name in seen if wanted.get(name)]
+    for number, seen in points_seen(model_path).items():
+        lost = [name for name in seen if wanted.get(name, 0) > 0]
         shown = {name: xy for name, xy in seen.items() if name in {*placed, *lost}}
         if not lost or len(needed & shown.keys()) < num_needed:
             continue
-        for name in lost:
-            wanted[name] -= 1
         for name, xy in shown.items():
+            wanted[name] = wanted.get(name, 0) - 1
             x, y = xy + random.normal(0.0, CLICK_ERROR_PX, 2)
             rows.append(f"{number},{name},{x:.1f},{y:.1f}\n")
     text = "point,photograph,x,y\n" + "".join(rows)
