@@ -102,8 +102,9 @@ def judged(chosen: Chosen, output_path: Path) -> Row:
         model_path = output_path / "sparse" / "0"
         poses = read_poses(model_path) if model_path.exists() else {}
         truth = read_poses(chosen.truth_path)
-        scores = pose_scores(poses, truth, sorted(counted))
-        found["right"] = len(scores.correct_names)
+        # Photographs beside those of the set tell better which of two is wrong
+        scores = pose_scores(poses, truth, report["photographs"].keys())
+        found["right"] = len(counted.intersection(scores.correct_names))
         found["sure_and_wrong"] = len(sure.intersection(scores.wrong_names))
     return found
 
