@@ -101,9 +101,12 @@ def judged(chosen: Chosen, output_path: Path) -> Row:
     if chosen.truth_path:
         model_path = output_path / "sparse" / "0"
         poses = read_poses(model_path) if model_path.exists() else {}
-        truth = read_poses(chosen.truth_path)
         # Photographs beside those of the set tell better which of two is wrong
-        scores = pose_scores(poses, truth, report["photographs"].keys())
+        scores = pose_scores(
+            poses,
+            read_poses(chosen.truth_path),
+            report["photographs"].keys(),
+        )
         found["right"] = len(counted.intersection(scores.correct_names))
         found["sure_and_wrong"] = len(sure.intersection(scores.wrong_names))
     return found
@@ -167,8 +170,10 @@ def write_marks(model_path: Path, report: Row, folder: Path) -> None:
             wanted[name] = wanted.get(name, 0) - 1
             x, y = xy + random.normal(0.0, CLICK_ERROR_PX, 2)
             rows.append(f"{number},{name},{x:.1f},{y:.1f}\n")
-    text = "point,photograph,x,y\n" + "".join(rows)
-    (folder / "tie-points.csv").write_text(text, encoding="utf-8")
+    (folder / "tie-points.csv").write_text(
+        "point,photograph,x,y\n" + "".join(rows),
+        encoding="utf-8",
+    )
 
 
 def follow(
@@ -224,9 +229,18 @@ def trials(
     write_names(chosen, chosen.step, base_path)
     if finished_path:
         shutil.copytree(finished_path, base_path / "out")
-    images = str((chosen.scene_path / "images").resolve())
-    base = [PROGRAM, "run", "--image-path", images, "--image-list-path", "names.txt"]
-    base += [*shlex.split(variant), "--quiet", "--output-path", "out"]
+    base = [
+        PROGRAM,
+        "run",
+        "--image-path",
+        str((chosen.scene_path / "images").resolve()),
+        "--image-list-path",
+        "names.txt",
+        *shlex.split(variant),
+        "--quiet",
+        "--output-path",
+        "out",
+    ]
     seconds, code = run_command(base, base_path)
     output_path = base_path / "out"
     report_path = output_path / "report.json"
@@ -271,8 +285,16 @@ def table_of(found: dict[str, list[Row]]) -> str:
                 told = f"exit code {row['exit']}"
             took = f"{row['seconds']:.0f}" if "seconds" in row else "-"
             chosen, _, variant = name.partition(" ")
-            line = [chosen, variant, row["code"], counts(before) or "none", told, took]
-            lines.append(line)
+            lines.append(
+                [
+                    chosen,
+                    variant,
+                    row["code"],
+                    counts(before) or "none",
+                    told,
+                    took,
+                ]
+            )
     return table(HEADER, lines)
 
 

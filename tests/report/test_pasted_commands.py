@@ -23,15 +23,16 @@ from colmap_affrect.session.context import Inputs
 
 def context_of(command: str, *, is_foreign: bool = False) -> Any:
     """What commands are made from, of a folder ``out`` in this one."""
-    workspace = SimpleNamespace(
-        path=Path("out"),
-        is_foreign=is_foreign,
-        database=Path("out/database.db"),
-        photographs=lambda: Path("photos"),
+    return SimpleNamespace(
+        workspace=SimpleNamespace(
+            path=Path("out"),
+            is_foreign=is_foreign,
+            database=Path("out/database.db"),
+            photographs=lambda: Path("photos"),
+        ),
+        command=tuple(shlex.split(command)),
+        inputs=Inputs(image_path="photos"),
     )
-    words = tuple(shlex.split(command))
-    inputs = Inputs(image_path="photos")
-    return SimpleNamespace(workspace=workspace, command=words, inputs=inputs)
 
 
 def parsed(command: str) -> Any:
@@ -121,10 +122,17 @@ def test_a_run_by_stages_is_run_anew_with_all_that_is_known_of_its_photographs()
 
 
 def test_what_takes_a_person_less_work_is_advised_first() -> None:
-    hours = Advice("photographs", "more")
-    minutes = [Advice("masks", "paint"), Advice("tie_points", "mark")]
-    nothing = [Advice("recipe", "more"), Advice("effort", "longer")]
-    given = [hours, *minutes, *nothing]
-    assert least_work_first(given) == (*nothing, *minutes, hours)
-    works = [one.work for one in least_work_first(given)]
-    assert works == ["nothing", "nothing", "minutes", "minutes", "hours"]
+    given = [
+        Advice("photographs", "more"),
+        Advice("masks", "paint"),
+        Advice("tie_points", "mark"),
+        Advice("recipe", "more"),
+        Advice("effort", "longer"),
+    ]
+    assert [(one.work, one.code) for one in least_work_first(given)] == [
+        ("nothing", "recipe"),
+        ("nothing", "effort"),
+        ("minutes", "masks"),
+        ("minutes", "tie_points"),
+        ("hours", "photographs"),
+    ]
