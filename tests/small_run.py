@@ -10,9 +10,10 @@ from small_comparison import IMAGE_SIZE, write_scene
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.advised import Advice
 from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
-from colmap_affrect.project.report import Advice, Bridge, ModelSummary
+from colmap_affrect.project.report import Bridge, ModelSummary
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
@@ -36,7 +37,7 @@ NAMES = (
 )
 """The second one is shown turned round where nobody takes care."""
 
-MORE = Advice("more photographs")
+MORE = Advice("photographs", "more photographs")
 
 
 def small_report(folder: Path) -> RunReport:
@@ -87,7 +88,11 @@ def small_report(folder: Path) -> RunReport:
         verification={"max_error_px": 3.0},
         mapping={"name": "sparse", "mapper_options": {}},
         advice=(
-            Advice("one camera", f"colmap-affrect run --output-path {folder}/out-2"),
+            Advice(
+                "effort",
+                "one camera",
+                f"colmap-affrect run --output-path {folder}/out-2",
+            ),
             MORE,
         ),
         guided={"pairs": 2, "matches_before": 20, "matches_after": 1050},

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.errors import Words, such_as, with_arguments
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.advised import Advice
 from colmap_affrect.project.camera_notes import camera_notes
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import (
@@ -109,17 +110,6 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
     for name, story in stories.items():
         names[story].append(name)
     return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
-
-
-@documented
-@dataclass(frozen=True)
-class Advice:
-    """What may help."""
-
-    why: str
-    """What it would be good for."""
-    command: str = ""
-    """Command for a shell; empty where none does it."""
 
 
 LEVELS = {  # how pairs are matched again, by the kind of the level

@@ -67,6 +67,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     lines = lines_of_report(context.features, line_findings)
     escalated = escalation_summary(context)
     escalates = escalated.matched_again or escalated.untried
+    focal_contradictions = contradictions_of_report(context, line_findings)
     report = RunReport(
         output_path=workspace.path,
         images_total=len(result.names),
@@ -83,7 +84,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         photographs=photographs_of_report(
             workspace, result.names, result.models, cameras, lines
         ),
-        focal_contradictions=contradictions_of_report(context, line_findings),
+        focal_contradictions=focal_contradictions,
         extended=tuple(result.extended),
         advice=advice(
             context,
@@ -92,6 +93,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
             max(pair_inliers.values(), default=0),
             escalated.untried,
             escalated.effort,
+            focal_contradictions,
         ),
         by_hand=by_hand.texts(),
         effort=escalated.effort if escalates else "",

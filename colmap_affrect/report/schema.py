@@ -6,10 +6,11 @@ from typing import Any, Literal
 import pydantic
 
 from colmap_affrect.mappers.camera_priors import FocalContradiction
+from colmap_affrect.project.advised import Advice
 from colmap_affrect.project.image_failures import FailureCode
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.reasons import DoubtCode, MissingCode
-from colmap_affrect.project.report import Advice, Bridge, MatchedAgain, Residual
+from colmap_affrect.project.report import Bridge, MatchedAgain, Residual
 from colmap_affrect.project.stage_warnings import WarningCode
 from colmap_affrect.report.photographs import PhotographReport
 
@@ -168,7 +169,7 @@ class ReportFile(Described):
     stages: list[StageEntry]
     """What each stage did, and how long that took."""
     advice: list[Advice]
-    """What to try next, the most promising first."""
+    """What to try next: first commands, then what takes a person minutes, then hours."""
     by_hand: list[str]
     """What was done otherwise than matches alone say."""
     effort: str

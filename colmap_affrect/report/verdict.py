@@ -108,9 +108,12 @@ def _headline(num: int, counts: Mapping[Quality, int], num_models: int) -> str:
 def _next_step(
     report: ReconstructionReport, counts: Mapping[Quality, int]
 ) -> tuple[str, str]:
-    """Return a sentence what to do next, and the command that does it."""
-    if report.advice:
-        first = report.advice[0]
+    """Return a sentence what to do next, and the command that does it.
+
+    Before hours are spent on doubtful or unsure photographs they are worth a look.
+    """
+    first = report.advice[0] if report.advice else None
+    if first and (first.work != "hours" or "missing" in counts):
         return f"Next: {first.why}.", first.command
     if not report.models:
         return "Next: more photographs, from places between those of these.", ""

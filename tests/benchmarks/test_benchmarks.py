@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from advice import follow, read_set
 from prints import KINDS, make_prints
 from synthetic import blobs, centroid
 
@@ -126,3 +127,22 @@ def test_a_print_has_the_camera_that_is_written_beside_it(
         assert np.abs(offset).max() < 0.02 * made.width
     else:
         assert np.abs(offset).max() > 0.02 * made.width
+
+
+def test_advice_is_followed_by_its_command_and_by_photographs_between(
+    tmp_path: Path,
+) -> None:
+    photographs = tmp_path / "scene" / "images"
+    photographs.mkdir(parents=True)
+    for number in range(6):
+        (photographs / f"{number}.jpg").touch()
+    chosen = read_set("scene:4:1", tmp_path)
+    assert chosen.names(chosen.step) == ["1.jpg", "5.jpg"]
+    base = ["colmap-affrect", "run", "--output-path", "out"]
+    more = {"code": "photographs", "command": ""}
+    assert follow(chosen, more, base, tmp_path) == base
+    assert (tmp_path / "names.txt").read_text() == "1.jpg\n3.jpg\n5.jpg\n"
+    command = {"code": "recipe", "command": "colmap-affrect run --output-path 'a b'"}
+    assert follow(chosen, command, base, tmp_path)[-1] == "a b"
+    marks = {"code": "tie_points", "command": "colmap-affrect run"}
+    assert follow(chosen, marks, base, tmp_path) == []

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from colmap_affrect.errors import with_flags
+from colmap_affrect.project.advised import Advice
 from colmap_affrect.project.camera_notes import merge_shared_cameras
 from colmap_affrect.project.image_failures import ImageFailure
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import (
-    Advice,
     Bridge,
     ModelSummary,
     ReconstructionReport,
@@ -60,7 +60,10 @@ REPORT = ReconstructionReport(
         "random_seed": 7,
         "mapper_options": {"mapper.init_max_error": 3.0},
     },
-    advice=(Advice("it tries more", "colmap-affrect run"), Advice("more photographs")),
+    advice=(
+        Advice("recipe", "it tries more", "colmap-affrect run"),
+        Advice("photographs", "more photographs"),
+    ),
     cameras=(
         {"id": 4, "source": "exif"},
         {"id": 2, "source": "guess"},
@@ -102,8 +105,8 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         },
         "doubtful": {}, "unsure": {}, "probabilities": {}, "hypotheses": [], "guided": {},
         "advice": [
-            {"why": "it tries more", "command": "colmap-affrect run"},
-            {"why": "more photographs", "command": ""},
+            {"code": "recipe", "why": "it tries more", "command": "colmap-affrect run"},
+            {"code": "photographs", "why": "more photographs", "command": ""},
         ],
         "cameras": list(REPORT.cameras), "points3D": 120, "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512, "models": [["a.png", "č d.png"], ["e.png", "f.png"]],

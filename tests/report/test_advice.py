@@ -71,7 +71,8 @@ def test_where_no_model_is_kept_what_its_photographs_lacked_is_advised(
     if doubts:
         write_thrown_away(ThrownAway({"a": doubts}), tmp_path)
     context: Any = SimpleNamespace(workspace=SimpleNamespace(sparse=tmp_path))
-    assert _why_no_model(context).endswith(why)
+    case = advice._Case(context, [], 3, [], ENOUGH, (), "high", ())
+    assert _why_no_model(case).endswith(why)
 
 
 def test_one_of_the_strongest_pairs_that_shows_depth_is_enough(

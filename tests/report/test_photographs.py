@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_run import NAMES, make_run_page, small_report
+from small_run import MORE, NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import ModelSummary
@@ -221,3 +221,23 @@ def test_the_headline_praises_only_what_is_sure(
     verdict = verdict_of(small_report(tmp_path), names, photographs)
     assert verdict.headline == headline
     assert verdict.next_step == "Next: one camera."
+
+
+@pytest.mark.parametrize(
+    ("qualities", "begins"),
+    [
+        (["sure", "unsure"], "The model in sparse/0 can be used; look at the unsure"),
+        (["sure", "doubtful"], "Next: look at the doubtful photographs"),
+        (["sure", "missing"], "Next: more photographs."),
+    ],
+)
+def test_photographs_are_looked_at_before_hours_are_spent_on_others(
+    qualities: list, begins: str, tmp_path: Path
+) -> None:
+    report = replace(small_report(tmp_path), advice=(MORE,))
+    photographs = {
+        f"{number}.jpg": PhotographReport(quality, 0)
+        for number, quality in enumerate(qualities)
+    }
+    verdict = verdict_of(report, [*photographs], photographs)
+    assert verdict.next_step.startswith(begins)

@@ -16,8 +16,8 @@ from small_comparison import IMAGE_SIZE
 from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.advised import Advice
 from colmap_affrect.project.reasons import Missing
-from colmap_affrect.project.report import Advice
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import pictures, run_page
 from colmap_affrect.report.pair_lines import PairFile
@@ -200,9 +200,11 @@ def test_advice_leads_to_the_tool_that_makes_what_its_command_takes(
     assert "data-tool" not in html.split("</header>")[0]
     cameras = ViewGraph(Workspace(folder / "out").database).cameras
     advised = (
-        Advice("mark six points", "colmap-affrect run --tie-points marks.csv"),
-        Advice("mask captions", "colmap-affrect run --mask-path masks"),
-        Advice("more photographs"),
+        Advice(
+            "tie_points", "mark six points", "colmap-affrect run --tie-points marks.csv"
+        ),
+        Advice("masks", "mask captions", "colmap-affrect run --mask-path masks"),
+        Advice("photographs", "more photographs"),
     )
     report = replace(small_report(tmp_path), advice=advised)
     page = write_run_page(

@@ -29,7 +29,10 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.camera_priors import FocalContradiction
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.mappers.wrong_models import ThrownAway
 from colmap_affrect.matchers.base import ImageFeatures
 from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors
 from colmap_affrect.pipeline import RunOptions, run
@@ -245,8 +248,8 @@ def test_focal_lengths_are_advised_where_they_are_unknown_or_contradicted(
     adviser: Adviser,
 ) -> None:
     unknown = {LOST: (Doubt("focal_unknown"),)}
-    by_film = adviser.anew("--focal-mm 50 --film-width-mm 36")
-    assert adviser.commands([], doubtful=unknown) == [by_film]
+    # A number in a command would be a guess; more photographs have no command either
+    assert adviser.commands([], doubtful=unknown) == ["", ""]
     contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
     found = adviser.commands([LOST], taken_out={LOST: (contradicted,)})
     assert found[0] == adviser.anew("--focal-length-px 8")
@@ -282,18 +285,36 @@ def test_a_given_principal_point_that_does_not_fit_is_left_open(
 
 
 def test_masks_and_rejected_pairs_are_advised_where_matches_contradict_a_pose(
-    adviser: Adviser,
+    adviser: Adviser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     masks = adviser.anew("--mask-path masks")
     more = adviser.anew("--recipe default")
     bridged = {LOST: Bridge(NAMES[1], 5, 9, 0.2)}
     little = {LOST: (Doubt("little_agreement", {"percent": 9}),)}
-    assert adviser.commands([], doubtful=little, gains={LOST: 0.3}) == [more, masks]
+    assert adviser.commands([], doubtful=little, gains={LOST: 0.3}) == [more, masks, ""]
     rejecting = f"{AGAIN} --reject-pair '{LOST},{NAMES[1]}'"
+    agreeing = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
+    assert agreeing == [masks, ""]  # the model says that these matches are right
+    disagrees = {(NAMES[1], LOST): 0.4}
+    monkeypatch.setattr(advice_module, "agreements", lambda *_: disagrees)
     found = adviser.commands([], doubtful=little, gains={}, bridges=bridged)
-    assert found == [rejecting, masks]
+    assert found == [masks, rejecting, ""]
     few = {LOST: (Doubt("few_matches"),)}
-    assert adviser.commands([], doubtful=few, bridges=bridged) == []
+    assert adviser.commands([], doubtful=few, bridges=bridged) == [""]
+
+
+def test_more_photographs_help_doubtful_ones_and_models_of_which_nothing_is_sure(
+    adviser: Adviser,
+) -> None:
+    few = {LOST: (Doubt("few_matches"),)}
+    doubtful = replace(adviser.model, doubtful=few, gains={})
+    (found,) = advice(adviser.context, [], [doubtful], 0)
+    assert found.why == f"more photographs, between {LOST} and the others"
+    unsure = replace(adviser.model, probabilities=dict.fromkeys(NAMES, 0.7))
+    (found,) = advice(adviser.context, [], [unsure], 0)
+    assert found.why == "more photographs, from places between those of these"
+    one_sure = replace(unsure, probabilities={**unsure.probabilities, LOST: 0.97})
+    assert advice(adviser.context, [], [one_sure], 0) == ()
 
 
 def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
@@ -312,6 +333,14 @@ def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
 
 
+def test_tie_points_that_begin_a_model_are_advised_where_there_is_none(
+    adviser: Adviser,
+) -> None:
+    (_, tie_points, _) = advice(adviser.context, [*NAMES], [], 0)
+    assert tie_points.code == "tie_points"
+    assert tie_points.why.startswith("mark seven points or more in two photographs")
+
+
 @pytest.mark.parametrize(
     ("shows_depth", "why"),
     [(True, "contradict each other"), (False, "show no depth")],
@@ -325,13 +354,66 @@ def test_strong_pairs_that_make_no_model_contradict_each_other_or_show_no_depth(
 ) -> None:
     found_depth = Mock(return_value=shows_depth)
     monkeypatch.setattr(advice_module, "_any_shows_depth", found_depth)
-    (found,) = advice(adviser.context, [*NAMES], [], 900)
+    *more, found = advice(adviser.context, [*NAMES], [], 900)
     assert why in found.why
+    # Other features show no depth either where there is none
+    codes = ["recipe", "tie_points"] if shows_depth else []
+    assert [one.code for one in more] == codes
 
 
 def test_matches_of_a_scene_with_depth_show_it(adviser: Adviser) -> None:
-    (found,) = advice(adviser.context, [*NAMES], [], 900)
+    *_, found = advice(adviser.context, [*NAMES], [], 900)
     assert "contradict each other" in found.why
+
+
+def test_doubts_of_models_that_were_thrown_away_are_advised_on(
+    adviser: Adviser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A given focal length can be the reason why there is no model."""
+    contradicted = Doubt("focal_contradicted", {"given_px": 9.0, "fitting_px": 8.1})
+    thrown_away = ThrownAway({LOST: (contradicted,)})
+    monkeypatch.setattr(advice_module, "read_thrown_away", lambda _: thrown_away)
+    first, *_ = advice(adviser.context, [*NAMES], [], 900)
+    assert first.command == adviser.anew("--focal-length-px 8")
+
+
+def test_the_default_mapper_is_advised_first_where_another_one_leaves_out(
+    adviser: Adviser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = "--mapper incremental --mapper-options a=1 b=2"
+    incremental = MAPPERS.options({"name": "incremental"}, "")
+    monkeypatch.setattr(Context, "mapping", incremental, raising=False)
+    asked = replace(adviser.context, command=tuple(shlex.split(f"{AGAIN} {given}")))
+    other = Adviser(asked, adviser.model)
+    first, *_ = other.commands([LOST])
+    assert first == other.anew("").replace("  ", " ")
+    assert "" in other.commands([LOST])  # more photographs
+    marks = advice_module.command_with_tie_points(asked)
+    assert marks == other.anew("--tie-points tie-points.csv")
+
+
+@pytest.mark.parametrize(
+    ("source", "given", "kept"),
+    [
+        ("given", "--focal-mm 9 --film-width-mm 36", ""),
+        ("exif", "", "--ignore-exif"),
+    ],
+)
+def test_focal_lengths_that_lines_contradict_are_left_out_where_something_is_missing(
+    adviser: Adviser, source: str, given: str, kept: str
+) -> None:
+    words = tuple(shlex.split(f"{AGAIN} {given}"))
+    asked = Adviser(replace(adviser.context, command=words), adviser.model)
+    found = FocalContradiction((LOST,), source, 900.0, 1400.0, 0.05)
+    first, *_ = advice(asked.context, [LOST], [asked.model], 0, contradictions=[found])
+    assert first.code == "lines_contradict"
+    flags = shlex.split(first.command)
+    assert [*filter(None, [kept])] == [
+        word for word in flags if word == "--ignore-exif"
+    ]
+    assert "--focal-mm" not in flags
+    assert "--film-width-mm" not in flags
+    assert not advice(asked.context, [], [asked.model], 0, contradictions=[found])
 
 
 def test_weights_are_advised_where_the_best_recipe_lacks_them(
@@ -610,7 +692,8 @@ def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
         MatchedAgain("new", 1, 60.0),
     ]
     context = Context(workspace, command=(*words, "--effort", "normal"))
-    more, *_ = advice(context, [NAMES[0]], report.models, 0, left, "normal")
+    found = advice(context, [NAMES[0]], report.models, 0, left, "normal")
+    more = found[-3]  # tie points and other photographs are more work
     assert more.why.startswith("not tried, at most about ")
     assert more.why.endswith(" min more: all tilts 28 pairs, new 1 pair")
     assert shlex.split(more.command) == [*words, "--effort", "high"]
