@@ -31,6 +31,7 @@ from colmap_affrect.images.exif import (
     CameraTags,
     ExifFocal,
     exif_focal,
+    has_other_shape,
     read_camera_tags,
 )
 from colmap_affrect.images.photographs import CameraOptions, photograph_files
@@ -69,7 +70,7 @@ class InitialCameras:
         self.image_path = image_path
         self.options = options
         self._given = read_given_cameras(options)
-        self._tags = cache(lambda name: read_camera_tags(image_path / name))
+        self._stored_tags = cache(lambda name: read_camera_tags(image_path / name))
 
     def given(self, name: str) -> GivenCamera:
         """Return what the user says of the camera of an image."""
@@ -332,6 +333,34 @@ class InitialCameras:
         All of the folder are looked at, but only where one is smaller than when it was taken.
         """
         return tags.scale < 1.0 and tags.body in self._cropped_bodies
+
+    def _tags(self, name: str) -> CameraTags | None:
+        """Return what the file of a photograph says of its camera; None if it has no header.
+
+        Programs that crop may leave out which size it had: others of its body may tell.
+        """
+        tags = self._stored_tags(name)
+        if tags is None or tags.original_size or not any(tags.body):
+            return tags
+        whole = self._whole_sizes.get(tags.body)
+        if whole is None:
+            return tags
+        return replace(tags, original_size=whole, is_size_of_others=True)
+
+    @cached_property
+    def _whole_sizes(self) -> dict[tuple[str, str, str], Size]:
+        """Largest size of photographs of each body that have several shapes, and no other size."""
+        sizes = defaultdict[tuple[str, str, str], list[Size]](list)
+        for name in photograph_files(self.image_path, IMAGE_SUFFIXES):
+            tags = self._stored_tags(name)
+            if tags and any(tags.body) and not tags.original_size:
+                sizes[tags.body].append(tags.size)
+        found = {}
+        for body, of_body in sizes.items():
+            whole = max(of_body, key=lambda size: (max(size), min(size), size))
+            if any(has_other_shape(size, whole) for size in of_body):
+                found[body] = whole
+        return found
 
     @cached_property
     def _cropped_bodies(self) -> set[tuple[str, str, str]]:

@@ -60,6 +60,7 @@ SHIFTED_SIGMA = 0.15
 MIN_EVIDENCE = 3.0
 # Nats, from which on lines say that the axis is not in the middle; theory
 SHIFT_EVIDENCE = 3.0
+DOWN = 0.0, 1.0  # of a picture that is stored as it stands, x right and y down; format
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ class LineCamera:
         shift: of the principal point, down from the middle, in longer sides.
         shift_sigma: its deviation.
         rotation: (3, 3), rows are the three directions in the camera's frame, for the likeliest.
-        up: (3,) the direction of these that is nearest to the upright of the image, upwards.
+        up: (3,) the direction of these that is nearest to the upright of the picture, upwards.
+        up_sigma: its deviation in radians, over all focal lengths and shifts.
     """
 
     focal: float
@@ -96,6 +98,7 @@ class LineCamera:
     shift_sigma: float
     rotation: Floats
     up: Floats
+    up_sigma: float
 
     @property
     def is_known(self) -> bool:
@@ -128,6 +131,7 @@ class Explanation:
         rotation: (3, 3), rows are the three directions in the camera's frame.
         kinds: (N,) number of the direction of each segment, ``CHANCE`` for none.
         evidence: nats by which the lines are likelier with these directions than by chance.
+        down: downwards in the picture, right and down in the image as stored.
     """
 
     focal: float
@@ -135,11 +139,12 @@ class Explanation:
     rotation: Floats
     kinds: Indices
     evidence: float
+    down: tuple[float, float] = DOWN
 
     @property
     def up(self) -> Floats:
-        """(3,) the direction that is nearest to the upright of the image, upwards."""
-        return upright_of(self.rotation)
+        """(3,) the direction that is nearest to the upright of the picture, upwards."""
+        return upright_of(self.rotation, self.down)
 
     @property
     def horizon(self) -> Floats:
@@ -155,10 +160,13 @@ class Lines:
     Attributes:
         segments: of the photograph.
         likelihood: of its camera; None where there are too few segments to say anything.
+        down: downwards in the picture, right and down in the image as stored: photographs that
+            a camera took on its side are often stored so.
     """
 
     segments: Segments
     likelihood: LineLikelihood | None
+    down: tuple[float, float] = DOWN
 
     @cached_property
     def says_shifted(self) -> bool:
@@ -183,7 +191,7 @@ class Lines:
         if self.likelihood is None:
             return None
         sigma = self.usual_shift_sigma if shift_sigma is None else shift_sigma
-        return line_camera(self.likelihood, sigma)
+        return line_camera(self.likelihood, sigma, self.down)
 
     def findings(self) -> LineFindings:
         """Return what the lines say in the end."""
@@ -211,22 +219,31 @@ class Lines:
             rotation=rotation,
             kinds=fit.kinds()[0],
             evidence=evidence,
+            down=self.down,
         )
 
 
-def measure_lines(segments: Segments) -> Lines:
-    """Return segments with what they say of the camera."""
-    return Lines(segments, line_likelihood(segments))
+def measure_lines(segments: Segments, down: tuple[float, float] = DOWN) -> Lines:
+    """Return segments with what they say of the camera.
+
+    Args:
+        segments: of the photograph.
+        down: downwards in the picture, right and down in the image as stored.
+    """
+    return Lines(segments, line_likelihood(segments), down)
 
 
 def line_camera(
-    likelihood: LineLikelihood, shift_sigma: float = MIDDLE_SIGMA
+    likelihood: LineLikelihood,
+    shift_sigma: float = MIDDLE_SIGMA,
+    down: tuple[float, float] = DOWN,
 ) -> LineCamera:
     """Return what lines say of a camera, together with what is usual.
 
     Args:
         likelihood: of the lines.
         shift_sigma: how far the optical axis may be from the middle beforehand, in longer sides.
+        down: downwards in the picture, right and down in the image as stored.
 
     Returns:
         The camera, with deviations.
@@ -240,14 +257,42 @@ def line_camera(
     shift = float(of_shifts @ SHIFTS)
     shift_variance = float(of_shifts @ (SHIFTS - shift) ** 2)
     rotation = likelihood.rotations[_likeliest(chances)]
+    up = upright_of(rotation, down)
     return LineCamera(
         focal=math.exp(log_focal),
         focal_sigma=math.hypot(math.sqrt(focal_variance), MODEL_SIGMA),
         shift=shift,
         shift_sigma=math.sqrt(shift_variance),
         rotation=rotation,
-        up=upright_of(rotation),
+        up=up,
+        up_sigma=_up_sigma(likelihood, chances, up, down),
     )
+
+
+def _up_sigma(
+    likelihood: LineLikelihood,
+    chances: Floats,
+    up: Floats,
+    down: tuple[float, float],
+) -> float:
+    """Return how far the uprights of all focal lengths and shifts are from one, in radians.
+
+    Lines of buildings have much the same upright whatever the focal length, leaves and faces
+    another one for each.
+
+    Args:
+        likelihood: of the lines.
+        chances: (F, S) probabilities of focal lengths and shifts.
+        up: (3,) the likeliest upright.
+        down: downwards in the picture, right and down in the image as stored.
+    """
+    downwards = likelihood.rotations[..., :2] @ np.array(down)
+    nearest = np.abs(downwards).argmax(axis=2)[..., None]
+    rows = np.take_along_axis(likelihood.rotations, nearest[..., None], axis=2)
+    signs = np.where(np.take_along_axis(downwards, nearest, axis=2) < 0.0, 1.0, -1.0)
+    ups = signs * rows[:, :, 0]
+    angles = np.arccos(np.clip(ups @ up, -1.0, 1.0))
+    return math.sqrt(float(np.sum(chances * angles**2)))
 
 
 def shift_evidence(likelihood: LineLikelihood) -> float:
@@ -260,10 +305,17 @@ def shift_evidence(likelihood: LineLikelihood) -> float:
     )
 
 
-def upright_of(rotation: Floats) -> Floats:
-    """Return the row of a (3, 3) rotation that is nearest to the image's upright, upwards."""
-    row = rotation[np.abs(rotation[:, 1]).argmax()]
-    return np.asarray(row if row[1] < 0.0 else -row)
+def upright_of(rotation: Floats, down: tuple[float, float] = DOWN) -> Floats:
+    """Return the row of a (3, 3) rotation that is nearest to the picture's upright, upwards.
+
+    Args:
+        rotation: rows are directions in the camera's frame.
+        down: downwards in the picture, right and down in the image as stored.
+    """
+    downwards = rotation[:, :2] @ np.array(down)
+    number = np.abs(downwards).argmax()
+    row = rotation[number]
+    return np.asarray(row if downwards[number] < 0.0 else -row)
 
 
 def _log_joint(likelihood: LineLikelihood, shift_sigma: float) -> Floats:

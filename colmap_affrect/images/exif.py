@@ -50,6 +50,8 @@ class CameraTags:
     # (width, height) when EXIF was written
     original_size: tuple[int, int] | None = None
     zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
+    # Whether the size is not by EXIF, but the largest that others of this body have
+    is_size_of_others: bool = False
 
     @property
     def identity(self) -> tuple[object, ...] | None:
@@ -76,9 +78,7 @@ class CameraTags:
     @property
     def was_cropped(self) -> bool:
         """Whether the shape is not that of the file that EXIF describes."""
-        return not _similar(
-            _aspect(self.size), _aspect(self.original_size or self.size)
-        )
+        return has_other_shape(self.size, self.original_size or self.size)
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,11 @@ def _aspect(size: tuple[int, int]) -> float:
     return max(size) / min(size)
 
 
+def has_other_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Tell whether photographs of two sizes differ in shape, turned or not."""
+    return not _similar(_aspect(first), _aspect(second))
+
+
 def _similar(first: float, second: float) -> bool:
     return abs(first / second - 1.0) <= MAX_ASPECT_ERROR
 
@@ -215,7 +220,8 @@ def _focal_of_crop(tags: CameraTags, sensor_width_mm: float | None) -> ExifFocal
 def _sizes(tags: CameraTags) -> str:
     size = tags.size
     original = tags.original_size or tags.size
-    return f"{size[0]} x {size[1]} px, when taken {original[0]} x {original[1]}"
+    taken = "others of its camera" if tags.is_size_of_others else "when taken"
+    return f"{size[0]} x {size[1]} px, {taken} {original[0]} x {original[1]}"
 
 
 def _statements(tags: CameraTags, sensor_width_mm: float | None) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from colmap_affrect.data import GrayImage, Mask
 from colmap_affrect.geometry.arrays import Bools, Floats
 from colmap_affrect.geometry.conventions import colmap_from_pixel
-from colmap_affrect.geometry.lines import Lines, measure_lines
+from colmap_affrect.geometry.lines import DOWN, Lines, measure_lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.images.reading import shrink_to
 
@@ -20,14 +20,17 @@ BORDER = 0.025
 ALONG = 0.05  # rad, of a segment that runs along the border; theory
 
 
-def lines_of(image: GrayImage, mask: Mask | None = None) -> Lines:
+def lines_of(
+    image: GrayImage, mask: Mask | None = None, down: tuple[float, float] = DOWN
+) -> Lines:
     """Return the straight lines of a photograph and what they say of its camera.
 
     Args:
         image: (H, W) gray values.
         mask: (H', W') where segments may be; None: everywhere.
+        down: downwards in the picture, right and down in the image as stored.
     """
-    return measure_lines(segments_of(image, mask))
+    return measure_lines(segments_of(image, mask), down)
 
 
 def segments_of(image: GrayImage, mask: Mask | None = None) -> Segments:

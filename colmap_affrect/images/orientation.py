@@ -10,11 +10,23 @@ from typing import BinaryIO
 import numpy as np
 from PIL import ExifTags
 
+from colmap_affrect.geometry.lines import DOWN
 from colmap_affrect.images.reading import PNG, open_image, read_header
 from colmap_affrect.images.tiff import stand_upright
 from colmap_affrect.project.atomic_files import replace_bytes
 
 UPRIGHT = 1  # EXIF's number; format
+# Downwards in the picture, in the image as stored, by EXIF's number; format
+DOWN_BY_ORIENTATION = {
+    1: DOWN,
+    2: DOWN,
+    3: (0.0, -1.0),
+    4: (0.0, -1.0),
+    5: (1.0, 0.0),
+    6: (1.0, 0.0),
+    7: (-1.0, 0.0),
+    8: (-1.0, 0.0),
+}
 JPEG_START = b"\xff\xd8"
 JPEG_EXIF = b"Exif\0\0"
 JPEG_XMP = b"http://ns.adobe.com/xap/1.0/\0"
@@ -41,6 +53,11 @@ def forget_orientation(path: Path) -> None:
 def orientation(path: Path) -> int:
     """Return EXIF's or XMP's number of how a picture lies, 1 where nothing says so."""
     return read_header(path, _orientation) or UPRIGHT
+
+
+def picture_down(path: Path) -> tuple[float, float]:
+    """Return downwards in a picture, right and down in the image as stored, by EXIF or XMP."""
+    return DOWN_BY_ORIENTATION.get(orientation(path), DOWN)
 
 
 def _orientation(file: BinaryIO) -> int:

@@ -45,6 +45,8 @@ SHIFTED_AXES = "with optical axes off the middle"
 
 # Of COLMAP's models, the largest ones, that are gone on from; resource
 NUM_COLMAP_MODELS = 2
+# Images of a model with shared cameras that is also adjusted with an axis for each; resource
+MAX_OWN_AXES = 12
 logger = logging.getLogger(__name__)
 
 
@@ -100,6 +102,7 @@ class HypothesisTest:
             self._try_colmap()
         self._try_straight_lens()
         self._try_shifted_axes()
+        self._try_own_shifted_axes()
         self._look_at_other_cameras()
         self.best = with_other_groups(self.search, self.best)
         self.best = joined_by_points(self.search, self.best)
@@ -213,6 +216,32 @@ class HypothesisTest:
                 replace(self.best[0], axis_turns_deg=turns_deg),
                 *self.best[1:],
             ]
+
+    def _try_own_shifted_axes(self) -> None:
+        """Free the principal points of images that seem to share cameras.
+
+        Prints of one size that were cut from photographs in different places share no camera: with
+        axes in the middle own ones bring little, and shared ones have no axis to free.
+        """
+        own = self.per_image
+        if own is None or not self.best or own.graph.has_rigs:
+            return
+        model = self.best[0].reconstruction
+        free = with_free_principal_points(own, self.task.cameras)
+        if free is None or model.num_reg_images() > MAX_OWN_AXES:
+            return
+        apart = own.grower(own.graph).remake(model)
+        if not gains_of_freedom(apart, own, free).contradict_constant:
+            return
+        shared = self.search, self.best
+        self.search = own
+        first = replace(self.best[0], reconstruction=apart, axis_turns_deg={})
+        others = [_remade(own, mapped) for mapped in self.best[1:]]
+        self.best = [first.also_by(PER_IMAGE_CAMERAS), *others]
+        if self._take_shifted_axes(free):
+            self.per_image = None
+        else:
+            self.search, self.best = shared
 
     def _take_shifted_axes(self, free: Search) -> bool:
         """Take the best model with free principal points where it scores higher; tell whether."""

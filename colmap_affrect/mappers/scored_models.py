@@ -18,16 +18,23 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.reliability import (
+    MAX_ERROR_DEG,
     NUM_REASONS,
     Confidence,
     score_images,
     share_within_limit,
 )
+from colmap_affrect.mappers.small_motions import small_motion
 from colmap_affrect.mappers.surer_apart import surer_apart
 from colmap_affrect.mappers.surroundings import cut_into_places, known_places
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, PrincipalPointContradiction
 
+CHANGE_SIGMA_DEG = 1.7
+"""Of the angle between poses by what moves and by the rest: what poses by the rest were off in a
+made-up set, the median (measured)."""
+NEGLIGIBLE = 0.01  # chance of wrong poses by a small motion, which is not told; numeric
+OF_WRONG_CAMERAS = {"focal_contradicted", "principal_point_contradicted"}
 MIN_PROBABILITY = 0.05
 """Images leave their model below this probability: nineteen of twenty such poses are wrong
 (theory)."""
@@ -102,6 +109,28 @@ def _doubt_motion(model: ScoredModel, task: MappingTask) -> None:
         doubt = Doubt("something_moves", {"percent": math.floor(100.0 * share)})
         for name in list(model.confidences):
             _doubt(model, name, share, doubt)
+        return
+    if _has_wrong_cameras(model):
+        return  # which make points fit badly, too
+    small = small_motion(model.mapped.reconstruction)
+    if small is None or not small.changes_deg:
+        return
+    # A model follows one of both as a whole: where they are farthest apart they are told best.
+    farther = (max(small.changes_deg.values()) - MAX_ERROR_DEG) / CHANGE_SIGMA_DEG
+    off = 0.5 * math.erfc(-farther / math.sqrt(2.0))  # where the rest is the scene
+    wrong = (1.0 - small.share) * off
+    if wrong > NEGLIGIBLE:
+        doubt = Doubt("something_moves", {"percent": math.floor(100.0 * small.share)})
+        for name in list(model.confidences):
+            _doubt(model, name, 1.0 - wrong, doubt)
+
+
+def _has_wrong_cameras(model: ScoredModel) -> bool:
+    """Tell whether the points of a model contradict what is given of cameras."""
+    for one in (*model.confidences.values(), *model.taken_out.values()):
+        if any(doubt.code in OF_WRONG_CAMERAS for doubt in one.reasons):
+            return True
+    return bool(model.contradictions)
 
 
 def _doubt_given_principal_points(scored: ScoredModel, task: MappingTask) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import TypeAdapter
 
-from colmap_affrect.geometry.lines import LineCamera, LineFindings, upright_of
+from colmap_affrect.geometry.lines import LineCamera, LineFindings
 from colmap_affrect.project.record import Content
 from colmap_affrect.project.sealed_json import read_sealed, write_sealed
 
@@ -30,7 +30,8 @@ class ImageSummary(NamedTuple):
 class _LineRow(NamedTuple):
     num_segments: int
     says_shifted: bool
-    # Focal length, shift, each followed by its deviation, and nine numbers of the rotation; or none
+    # Focal length, shift, each followed by its deviation, nine numbers of the rotation, three of
+    # the upright and its deviation; or none
     camera: list[float]
 
 
@@ -49,9 +50,9 @@ class _Table:
 
 
 TABLE_JSON = TypeAdapter(_Table)
-NUM_CAMERA_VALUES = 13  # format
+NUM_CAMERA_VALUES = 17  # format
 # Counts up when the same features give other summaries, as by other priors of lines; format
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 def summary_path(features_path: Path) -> Path:
@@ -118,6 +119,7 @@ def _line_row(found: LineFindings) -> _LineRow:
     if camera:
         values = [camera.focal, camera.focal_sigma, camera.shift, camera.shift_sigma]
         values += camera.rotation.ravel().tolist()
+        values += [*camera.up.tolist(), camera.up_sigma]
     return _LineRow(found.num_segments, found.says_shifted, values)
 
 
@@ -128,13 +130,14 @@ def _findings_of(row: _LineRow) -> LineFindings:
     if len(row.camera) != NUM_CAMERA_VALUES:
         raise ValueError(f"a camera of {len(row.camera)} numbers")
     focal, focal_sigma, shift, shift_sigma, *values = row.camera
-    rotation = np.array(values).reshape(3, 3)
+    rotation = np.array(values[:9]).reshape(3, 3)
     camera = LineCamera(
         focal=focal,
         focal_sigma=focal_sigma,
         shift=shift,
         shift_sigma=shift_sigma,
         rotation=rotation,
-        up=upright_of(rotation),
+        up=np.array(values[9:12]),
+        up_sigma=values[12],
     )
     return LineFindings(row.num_segments, camera, row.says_shifted)

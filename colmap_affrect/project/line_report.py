@@ -1,5 +1,6 @@
 """What is stored and reported of the straight lines of a photograph."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.lines import (
+    DOWN,
     FOCALS,
     MIN_NUM_SEGMENTS,
     SHIFTS,
@@ -25,7 +27,8 @@ LIKELIHOODS = "line_log_likelihoods"  # (F, S) of focal lengths and shifts
 ROTATIONS = "line_rotations"  # (F, S, 3, 3)
 DISTORTION = "line_distortion"  # (1,), of :meth:`Segments.undistorted`
 # Of an image, beside its features
-LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS, DISTORTION)
+DOWNWARDS = "line_down"  # (2,), of photographs that are stored on their side
+LINE_DATASETS = (SEGMENTS, LIKELIHOODS, ROTATIONS, DISTORTION, DOWNWARDS)
 
 
 @documented
@@ -51,6 +54,8 @@ class LineReport:
     """Whether the lines say that the optical axis is not in the middle."""
     up: tuple[float, float, float] | None = None
     """The upright direction in the frame of the camera: x right, y down, z ahead."""
+    up_sigma_deg: float | None = None
+    """Its deviation; one of more than a few degrees is by chance."""
 
     def sentence(self) -> str:
         """Return what the lines say in a sentence."""
@@ -95,6 +100,7 @@ def line_report(found: LineFindings, image_size: tuple[int, int]) -> LineReport:
         shift_sigma_px=camera.shift_sigma * longer_side,
         is_shifted=found.says_shifted,
         up=(x, y, z),
+        up_sigma_deg=math.degrees(camera.up_sigma),
     )
 
 
@@ -106,6 +112,8 @@ def line_datasets(lines: Lines) -> dict[str, NDArray[Any]]:
         datasets[LIKELIHOODS] = lines.likelihood.log_likelihoods.astype(np.float32)
         datasets[ROTATIONS] = lines.likelihood.rotations.astype(np.float32)
         datasets[DISTORTION] = np.array([lines.likelihood.distortion], np.float32)
+    if lines.down != DOWN:
+        datasets[DOWNWARDS] = np.array(lines.down, np.float32)
     return datasets
 
 
@@ -115,8 +123,10 @@ def lines_from_datasets(datasets: Mapping[str, NDArray[Any]]) -> Lines | None:
         return None
     ends = datasets[SEGMENTS].astype(np.float64)
     segments = Segments(ends[:, :2], ends[:, 2:])
+    right, downwards = datasets.get(DOWNWARDS, np.array(DOWN)).tolist()
+    down = (right, downwards)
     if LIKELIHOODS not in datasets:
-        return Lines(segments, None)
+        return Lines(segments, None, down)
     log_likelihoods = datasets[LIKELIHOODS].astype(np.float64)
     if log_likelihoods.shape != (len(FOCALS), len(SHIFTS)):
         return None
@@ -129,4 +139,5 @@ def lines_from_datasets(datasets: Mapping[str, NDArray[Any]]) -> Lines | None:
             rotations=datasets[ROTATIONS].astype(np.float64),
             distortion=float(distortion[0]),
         ),
+        down,
     )

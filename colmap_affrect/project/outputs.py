@@ -127,6 +127,27 @@ def refuse_other_kind(
         )
 
 
+def refuse_taken_places(
+    *targets: Path, names: Collection[str] = (), replaces: bool = False
+) -> None:
+    """Refuse places of results that are taken, or among photographs.
+
+    Args:
+        targets: files or folders to be made.
+        names: of photographs, in whose folder no results may be.
+        replaces: whether files that are there give way.
+
+    Raises:
+        OptionError: a target is there already, is a symbolic link, or lies among photographs.
+    """
+    for target in targets:
+        refuse_link(target)
+        _refuse_models_of_a_run(target)
+        refuse_photographs(target, names)
+    if not replaces:
+        _refuse_existing(targets)
+
+
 @contextmanager
 def new_results(
     *targets: Path, names: Collection[str] = (), replaces: bool = False
@@ -138,12 +159,7 @@ def new_results(
     OptionError, before anything is made, where a target is there already, is a symbolic link, or
     lies among photographs of these ``names``, WorkspaceError when something cannot be written.
     """
-    for target in targets:
-        refuse_link(target)
-        _refuse_models_of_a_run(target)
-        refuse_photographs(target, names)
-    if not replaces:
-        _refuse_existing(targets)
+    refuse_taken_places(*targets, names=names, replaces=replaces)
     with ExitStack() as stack:
         folders = dict[Path, Path]()
         for target in targets:

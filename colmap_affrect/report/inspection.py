@@ -23,7 +23,9 @@ from colmap_affrect.data import (
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Bytes
+from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.images.lines import lines_of
+from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.project.atomic_files import replace_bytes
 from colmap_affrect.project.line_report import line_report
 from colmap_affrect.project.outputs import fitting_name, new_results
@@ -241,15 +243,18 @@ def inspect_image(
             draw_sheet(level, line, sheet)
             why = level.not_rectified
             lines.append(f"{line}; not rectified: {why}" if why else line)
-        lines.append(_draw_lines(photographs[0], original_size, new_sheets[0]))
+        found = lines_of(photographs[0].gray, photographs[0].mask, picture_down(path))
+        lines.append(_draw_lines(photographs[0], original_size, found, new_sheets[0]))
     return "\n".join([*lines, *map(str, sheets)])
 
 
 def _draw_lines(
-    photograph: Photograph, original_size: tuple[int, int], sheet: Path
+    photograph: Photograph,
+    original_size: tuple[int, int],
+    found: Lines,
+    sheet: Path,
 ) -> str:
     """Draw the straight lines of a photograph; return what they say."""
-    found = lines_of(photograph.gray, photograph.mask)
     report = line_report(found.findings(), original_size)
     replace_bytes(sheet, line_sheet(photograph.gray, found, report, photograph.mask))
     return f"lines: {report.sentence()}"

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,10 +17,11 @@ from colmap_affrect.errors import ImageError, OptionError, shown
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.conventions import HALF_PIXEL
-from colmap_affrect.geometry.lines import Explanation, Lines
+from colmap_affrect.geometry.lines import DOWN, Explanation, Lines
 from colmap_affrect.geometry.vanishing import CHANCE
 from colmap_affrect.images import reading
 from colmap_affrect.images.lines import lines_of
+from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.options import Summarized, documented
 from colmap_affrect.project.image_failures import (
     ImageFailure,
@@ -27,8 +29,17 @@ from colmap_affrect.project.image_failures import (
     failures_to_mapping,
 )
 from colmap_affrect.project.line_report import LineReport, line_report
-from colmap_affrect.project.outputs import fitting_name, new_results
-from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
+from colmap_affrect.project.outputs import (
+    fitting_name,
+    new_results,
+    refuse_taken_places,
+)
+from colmap_affrect.project.paths import (
+    PathLike,
+    as_path,
+    as_path_or_none,
+    resolved,
+)
 from colmap_affrect.report.sheets import Color, Panel, encode_png, rgb, row_of, text_row
 
 logger = logging.getLogger(__name__)
@@ -103,16 +114,18 @@ def camera_from_lines(
         ImageError: the photograph cannot be read.
         OptionError: the array is no photograph, or the mask has another size.
     """
-    gray = (
-        _gray_values(image)
-        if isinstance(image, np.ndarray)
-        else read_gray(as_path(image))
-    )
+    down = DOWN
+    if isinstance(image, np.ndarray):
+        gray = _gray_values(image)
+    else:
+        path = as_path(image)
+        gray = read_gray(path)
+        down = picture_down(path)
     if mask is not None and mask.shape != gray.shape:
         raise OptionError(
             f"has the shape {mask.shape}, and the photograph {gray.shape}", where="mask"
         )
-    found = lines_of(gray, mask).findings()
+    found = lines_of(gray, mask, down).findings()
     return line_report(found, (gray.shape[1], gray.shape[0]))
 
 
@@ -124,32 +137,55 @@ def report_lines(
     Args:
         paths: of the photographs.
         output_path: folder for a picture of the lines of each photograph; None: none are drawn.
+            Where two photographs have one name, pictures stand in the folders of their photographs.
 
     Returns:
         What the lines say, and why photographs cannot be read.
 
     Raises:
-        OptionError: a picture is there already.
+        OptionError: a picture is there already, or would lie among the photographs; nothing
+            is measured then.
         WorkspaceError: a picture cannot be written.
     """
     folder = as_path_or_none(output_path, "output_path")
+    photographs = list(dict.fromkeys(as_path(given, "paths") for given in paths))
+    pictures = {} if folder is None else _picture_paths(photographs, folder)
+    for path, picture in pictures.items():
+        refuse_taken_places(picture, names=[path.name])
     found = LineReports()
-    for path in dict.fromkeys(as_path(given, "paths") for given in paths):
+    for path in photographs:
         try:
             gray = read_gray(path)
         except ImageError as error:
             logger.warning("%s", error)
             found.failed[str(path)] = failure_of(error)
             continue
-        lines = lines_of(gray)
+        lines = lines_of(gray, down=picture_down(path))
         report = line_report(lines.findings(), (gray.shape[1], gray.shape[0]))
         found.photographs[str(path)] = report
-        if folder is not None:
-            picture = folder / fitting_name(path.name, "-lines.png")
+        if path in pictures:
+            picture = pictures[path]
             with new_results(picture, names=[path.name]) as (new_picture,):
                 new_picture.write_bytes(line_sheet(gray, lines, report))
             found.pictures[str(path)] = picture
     return found
+
+
+def _picture_paths(photographs: Sequence[Path], folder: Path) -> dict[Path, Path]:
+    """Return where the lines of each photograph are drawn: in one folder, if names differ."""
+    parents = [resolved(path.parent) for path in photographs]
+    names = {path.name for path in photographs}
+    is_flat = len(names) == len(photographs)
+    found = {}
+    for path, parent in zip(photographs, parents, strict=True):
+        inner = Path() if is_flat else _below_common(parent, parents)
+        found[path] = folder / inner / fitting_name(path.name, "-lines.png")
+    return found
+
+
+def _below_common(parent: Path, parents: Sequence[Path]) -> Path:
+    """Return a folder as seen from the one that all of these are in."""
+    return parent.relative_to(os.path.commonpath(parents))
 
 
 def read_gray(path: Path) -> GrayImage:

@@ -11,6 +11,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.lines import (
+    DOWN,
     FOCALS,
     MIN_EVIDENCE,
     SHIFTS,
@@ -78,8 +79,9 @@ def _upright(model: pycolmap.Reconstruction, features: FeatureStore) -> Upright 
     directions = []
     for image in images:
         axes = _axes(image)
-        held.append(-axes[:, 1])
         lines = lines_of_images.get(image.name)
+        down = DOWN if lines is None else lines.down
+        held.append(-axes[:, :2] @ np.array(down))
         up = (
             None
             if lines is None
@@ -109,7 +111,7 @@ def _up_in_camera(lines: Lines, camera: pycolmap.Camera) -> Floats | None:
     column = int(np.abs(SHIFTS - shift).argmin())
     if lines.likelihood.log_likelihoods[row, column] < MIN_EVIDENCE:
         return None
-    return upright_of(lines.likelihood.rotations[row, column])
+    return upright_of(lines.likelihood.rotations[row, column], lines.down)
 
 
 def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -36,6 +36,7 @@ from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.images.lines import lines_of
+from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
 from colmap_affrect.progress import SILENT, Progress
@@ -167,6 +168,10 @@ class ImageExtractor:
             resized = resized_from_original(original_size, photograph.size)
             frames = transform_lafs(np.linalg.inv(resized), features.lafs)
             features = replace(features, lafs=frames)
+        lines = None
+        if with_lines:
+            down = picture_down(path)
+            lines = lines_of(photograph.gray, photograph.mask, down)
         keep = is_inside(features.keypoints, original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
@@ -176,7 +181,7 @@ class ImageExtractor:
             image_size=original_size,
             not_rectified=not_rectified,
             stretched=photograph.stretched,
-            lines=lines_of(photograph.gray, photograph.mask) if with_lines else None,
+            lines=lines,
         )
 
     def photograph(

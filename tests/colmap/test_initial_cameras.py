@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -395,3 +396,42 @@ def test_where_one_photograph_was_cropped_a_smaller_one_of_its_body_may_be_a_cro
         _, record = with_crop.camera([name], size)
         assert record.source == "guess"
         assert record.uncropped_px == pytest.approx(50 / 35.8 * 4368)
+
+
+def test_photographs_of_one_body_with_several_shapes_are_crops_of_the_largest(
+    tmp_path: Path,
+) -> None:
+    """Programs that crop may leave out the size that EXIF had."""
+    tags = {
+        **BODY,
+        "FocalLength": 50.0,
+        "FocalLengthIn35mmFilm": 50,
+    }
+    photos = tmp_path / "photos"
+    for name, size in (
+        ("whole.jpg", (1500, 1000)),
+        ("upright.jpg", (1000, 1500)),
+        ("same.jpg", (900, 600)),
+    ):
+        write_photograph(photos / name, size, tags)
+    initial = InitialCameras(photos, CameraOptions())
+    _, record = initial.camera(["same.jpg"], (900, 600))
+    assert record.source == "exif"  # no other shape: it may have been shrunk
+    write_photograph(photos / "cut.jpg", (800, 760), tags)
+    with_crop = InitialCameras(photos, CameraOptions())
+    whole_px = 50.0 / math.hypot(36.0, 24.0) * math.hypot(1500.0, 1000.0)
+    for name, size in (
+        ("whole.jpg", (1500, 1000)),
+        ("upright.jpg", (1000, 1500)),
+    ):
+        _, record = with_crop.camera([name], size)
+        assert record.source == "exif"
+        assert record.focal_px == pytest.approx(whole_px, rel=0.01)
+    for name, size in (
+        ("cut.jpg", (800, 760)),
+        ("same.jpg", (900, 600)),
+    ):
+        _, record = with_crop.camera([name], size)
+        assert record.source == "guess"
+        assert record.uncropped_px == pytest.approx(whole_px, rel=0.01)
+        assert "others of its camera 1500 x 1000" in record.why

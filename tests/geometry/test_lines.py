@@ -163,6 +163,7 @@ def test_rows_of_the_rotation_are_the_directions_and_up_points_up() -> None:
     assert (
         angle_deg(camera.up, -building.rotation[:, 1]) < 1.5
     )  # down is the second column
+    assert np.rad2deg(camera.up_sigma) < 2.0
     assert camera.up[1] < -0.9
     assert camera.up[2] == pytest.approx(-building.rotation[2, 1], abs=0.02)
 
@@ -253,6 +254,7 @@ def test_lines_by_chance_say_nothing() -> None:
         assert not camera.is_known
         assert camera.focal_sigma > 0.25
         assert 0.6 < camera.focal < 2.4
+        assert np.rad2deg(camera.up_sigma) > 4.0
 
 
 def test_few_lines_say_nothing_at_all() -> None:
@@ -300,6 +302,20 @@ def test_up_is_the_row_nearest_to_the_images_upright() -> None:
     rotation = np.stack([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])
     assert_allclose(upright_of(rotation), [0.0, -0.8, 0.6])
     assert_allclose(upright_of(-rotation), [0.0, -0.8, 0.6])
+
+
+def test_the_deviation_of_the_upright_is_that_of_all_focal_lengths_and_shifts() -> None:
+    logs = np.full((len(FOCALS), len(SHIFTS)), -50.0)
+    rotations = np.tile(np.eye(3), (*logs.shape, 1, 1))
+    middle = len(SHIFTS) // 2
+    first, second = 10, 11
+    logs[[first, second], middle] = 0.0
+    rotations[first, middle] = turn(0, 6.0)
+    prior = -0.5 * (np.log(FOCALS / 1.2) / 0.5) ** 2
+    chances = np.exp(prior[[first, second]])
+    share = chances.min() / chances.sum()  # of the less likely of both
+    camera = line_camera(LineLikelihood(logs, rotations))
+    assert np.rad2deg(camera.up_sigma) == pytest.approx(6.0 * np.sqrt(share), rel=1e-3)
 
 
 def test_horizontal_directions_vanish_on_the_horizon() -> None:

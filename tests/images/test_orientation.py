@@ -6,12 +6,17 @@ import re
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from exported_model import SIZE, write_model
 from PIL import Image, ImageOps
 from synthetic import texture
 
-from colmap_affrect.images.orientation import forget_orientation, orientation
+from colmap_affrect.images.orientation import (
+    forget_orientation,
+    orientation,
+    picture_down,
+)
 from colmap_affrect.interop.export import export
 
 XMP = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF
@@ -101,3 +106,34 @@ def test_damaged_pictures_are_left_as_they_are(tmp_path: Path) -> None:
         path.write_bytes(start)
         forget_orientation(path)
         assert path.read_bytes() == start
+
+
+@pytest.mark.parametrize("number", range(1, 9))
+def test_downwards_is_where_the_lower_edge_of_the_picture_is_stored(
+    tmp_path: Path, number: int
+) -> None:
+    stored = np.full((40, 60), 20, np.uint8)
+    expected = {
+        1: (0, 1),
+        2: (0, 1),
+        3: (0, -1),
+        4: (0, -1),
+        5: (1, 0),
+        6: (1, 0),
+        7: (-1, 0),
+        8: (-1, 0),
+    }
+    right, down = expected[number]
+    columns = slice(None) if right == 0 else slice(30, 60) if right > 0 else slice(30)
+    rows = slice(None) if down == 0 else slice(20, 40) if down > 0 else slice(20)
+    stored[rows, columns] = 220
+    exif = Image.Exif()
+    exif[0x112] = number
+    path = tmp_path / "a.png"
+    Image.fromarray(stored).save(path, exif=exif)
+    assert picture_down(path) == (right, down)
+    with Image.open(path) as picture:
+        shown = np.asarray(ImageOps.exif_transpose(picture))
+    middle = shown.shape[0] // 2
+    assert shown[middle:].min() == 220
+    assert shown[:middle].max() == 20

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.geometry.lines import FOCALS, SHIFTS, LineLikelihood, Lines
+from colmap_affrect.geometry.lines import DOWN, FOCALS, SHIFTS, LineLikelihood, Lines
 from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.interop.align import align
 from colmap_affrect.interop.export import export
@@ -27,7 +27,11 @@ UP = (
 )  # in the frame of the model
 
 
-def lines_that_say(up_in_camera: np.ndarray, evidence: float = 20.0) -> Lines:
+def lines_that_say(
+    up_in_camera: np.ndarray,
+    evidence: float = 20.0,
+    down: tuple[float, float] = DOWN,
+) -> Lines:
     """Lines of which the second of the three directions is upright, for all focal lengths."""
     first = np.cross(up_in_camera, [0.0, 0.0, 1.0])
     first /= np.linalg.norm(first)
@@ -36,7 +40,7 @@ def lines_that_say(up_in_camera: np.ndarray, evidence: float = 20.0) -> Lines:
     likelihood = LineLikelihood(
         np.full(grid, evidence), np.tile(rotation, (*grid, 1, 1))
     )
-    return Lines(Segments(np.zeros((0, 2)), np.zeros((0, 2))), likelihood)
+    return Lines(Segments(np.zeros((0, 2)), np.zeros((0, 2))), likelihood, down)
 
 
 def write_run(
@@ -108,6 +112,28 @@ def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None
         export(folder / "sparse" / "0", tmp_path / "out", "text", note=said.append)
     assert said == []
     assert_allclose(up_of(before, exported(tmp_path / "out")), UP, atol=1e-6)
+
+
+def test_photographs_that_are_stored_on_their_side_have_their_own_upright(
+    tmp_path: Path,
+) -> None:
+    """As a telephone that is held upright stores them; their EXIF says so."""
+    before = write_run(tmp_path / "run", wrong=0)
+    store = FeatureStore(tmp_path / "run" / "features.h5")
+    up_in_model = turn(2, 90.0) @ UP  # along the x axes of the cameras
+    for image in before.images.values():
+        up = image.cam_from_world().rotation.matrix() @ up_in_model
+        store.write(
+            image.name,
+            LocalFeatures.empty(8),
+            SIZE,
+            lines=lines_that_say(up, down=(-1.0, 0.0)),
+        )
+    export(tmp_path / "run" / "sparse" / "0", tmp_path / "out", "text")
+    after = exported(tmp_path / "out")
+    old = before.images[1].cam_from_world().rotation.matrix()
+    new = after.images[1].cam_from_world().rotation.matrix()
+    assert_allclose(new.T @ old @ up_in_model, [0.0, 0.0, 1.0], atol=1e-6)
 
 
 def test_a_damaged_store_of_features_keeps_no_model_from_being_exported(

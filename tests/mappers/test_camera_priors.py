@@ -46,7 +46,13 @@ def by_lines(
     shift_sigma: float = SHIFTED_SIGMA,
 ) -> LineCamera:
     return LineCamera(
-        focal, sigma, shift, shift_sigma, np.eye(3), np.array([0.0, -1.0, 0.0])
+        focal=focal,
+        focal_sigma=sigma,
+        shift=shift,
+        shift_sigma=shift_sigma,
+        rotation=np.eye(3),
+        up=np.array([0.0, -1.0, 0.0]),
+        up_sigma=0.0,
     )
 
 

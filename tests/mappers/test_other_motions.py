@@ -24,6 +24,7 @@ from wall_scene import (
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import Side
+from colmap_affrect.mappers import scored_models
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.mapping import map_database, read_models
 from colmap_affrect.mappers.other_cameras import OtherCameras
@@ -33,6 +34,8 @@ from colmap_affrect.mappers.other_motions import (
     share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
+from colmap_affrect.mappers.small_motions import SmallMotion
+from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import DOUBTFUL, SURE, ModelSummary
 
 NUM_POINTS = 1200
@@ -158,6 +161,36 @@ def test_what_freed_cameras_hide_is_doubted_all_the_same(tmp_path: Path) -> None
     found = summary(path, mapped)
     assert len(found.doubtful) == NUM_IMAGES
     assert max(found.probabilities.values()) < DOUBTFUL < SURE
+
+
+@pytest.mark.parametrize(
+    ("change_deg", "is_doubted"),
+    [
+        (9.0, True),
+        (1.0, False),
+    ],
+)
+def test_a_model_is_as_sure_as_a_small_motion_that_turns_it_is_not_the_scene(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change_deg: float,
+    *,
+    is_doubted: bool,
+) -> None:
+    changes_deg = {
+        "0.jpg": change_deg,
+        "1.jpg": 0.5,
+    }
+    small = SmallMotion(0.6, changes_deg)
+    monkeypatch.setattr(scored_models, "small_motion", lambda _: small)
+    path = tmp_path / "still.db"
+    found = summary(path, MappedModel(scene(path, -np.inf)))
+    assert bool(found.sure) != is_doubted
+    if is_doubted:
+        assert max(found.probabilities.values()) < 0.65
+        doubts = {**found.doubtful, **found.unsure}
+        assert len(doubts) == NUM_IMAGES
+        assert doubts["0.jpg"][0] == Doubt("something_moves", {"percent": 60})
 
 
 @pytest.mark.parametrize("are_shared", [True, False])

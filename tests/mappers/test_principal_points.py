@@ -142,6 +142,33 @@ def test_axes_off_the_middle_are_found_and_better_rotations_with_them(
         assert np.abs(center_of(image.camera) - true_center).max() < 80.0
 
 
+@pytest.mark.parametrize(
+    ("share", "is_off"),
+    [
+        (1.0, True),
+        (0.0, False),
+    ],
+)
+def test_prints_of_one_size_that_were_cut_in_different_places_share_no_camera(
+    tmp_path: Path, share: float, *, is_off: bool
+) -> None:
+    path = tmp_path / "database.db"
+    truth = write_prints(path, share)
+    records = {}
+    for key in truth.cameras:
+        records[key] = replace(UNKNOWN, names=(f"{key}.jpg",))
+    task = MappingTask(path, None, cameras=records, may_share=True)
+    model = mapper_of("sparse").map(task, path.parent, 0, lambda _: None)[0]
+    images = model.reconstruction.images.values()
+    num_cameras = len({image.camera_id for image in images})
+    assert (SHIFTED_AXES in model.hypotheses) == is_off
+    assert not is_off or num_cameras == NUM_IMAGES
+    for image in images:
+        offset_px = center_of(image.camera) - np.array(SIZE) / 2.0
+        expected_px = share * OFFSETS_PX[image.image_id - 1]
+        assert np.abs(offset_px - expected_px).max() < 80.0
+
+
 def test_rotations_are_unclear_where_free_axes_make_no_better_model(
     tmp_path: Path,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -73,6 +74,24 @@ def test_lines_come_back_as_written_and_stay_when_features_are_added(
     assert without.likelihood is None
     assert len(without.segments) == 6
     store.check_all()
+
+
+def test_how_a_photograph_is_stored_comes_back_with_its_lines(tmp_path: Path) -> None:
+    store = FeatureStore(tmp_path / "features.h5")
+    lines = replace(peaked(0.9, 0.1), down=(-1.0, 0.0))
+    store.write("a.png", some_features(3), SIZE, lines=lines)
+    store.write("b.png", some_features(3), SIZE, lines=replace(few(), down=(0.0, -1.0)))
+    read = store.lines_of(["a.png", "b.png"])
+    assert read["a.png"].down == (-1.0, 0.0)
+    assert read["b.png"].down == (0.0, -1.0)
+    camera = lines.camera()
+    assert camera is not None
+    found = store.line_findings()["a.png"].camera
+    assert found is not None
+    assert_allclose(found.up, camera.up, atol=1e-6)
+    again = FeatureStore(store.path).line_findings()["a.png"].camera
+    assert again is not None
+    assert_allclose(again.up, camera.up, atol=1e-6)
 
 
 def test_stores_of_before_and_of_another_grid_have_no_lines(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from line_scenes import SIZE, Building
+from PIL import ExifTags, Image
 from synthetic import write_image
 
 from colmap_affrect.data import GrayImage
@@ -107,3 +108,46 @@ def test_what_cannot_be_read_is_passed_over_and_nothing_is_overwritten(
         report_lines([good], tmp_path / "out")
     with pytest.raises(OptionError):
         report_lines([good], tmp_path / "photos" / "a.png" / "x")
+
+
+def test_photographs_of_one_name_have_pictures_of_their_own(
+    tmp_path: Path, drawing: GrayImage
+) -> None:
+    paths = []
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        paths.append(write_image(tmp_path / name / "1.png", drawing[:400, :600]))
+    found = report_lines(paths, tmp_path / "out")
+    assert [found.pictures[str(path)] for path in paths] == [
+        tmp_path / "out" / "left" / "1.png-lines.png",
+        tmp_path / "out" / "right" / "1.png-lines.png",
+    ]
+    assert all(path.is_file() for path in found.pictures.values())
+
+
+def test_a_place_that_is_taken_is_refused_before_anything_is_drawn(
+    tmp_path: Path, drawing: GrayImage
+) -> None:
+    paths = []
+    for name in ("a.png", "b.png"):
+        (tmp_path / name[0]).mkdir()
+        paths.append(write_image(tmp_path / name[0] / name, drawing[:400, :600]))
+    with pytest.raises(OptionError, match="lies in the folder of the photographs"):
+        report_lines(paths, tmp_path / "b" / "out")
+    assert not (tmp_path / "b" / "out").exists()
+
+
+def test_a_photograph_that_is_stored_on_its_side_has_the_upright_of_its_picture(
+    tmp_path: Path, drawing: GrayImage
+) -> None:
+    upright = camera_from_lines(write_image(tmp_path / "a.png", drawing)).up
+    assert upright is not None
+    right, down, ahead = upright
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # the camera was turned to the right
+    path = tmp_path / "b.png"
+    Image.fromarray(np.rot90(drawing)).save(path, exif=exif)
+    found = camera_from_lines(path).up
+    assert found == pytest.approx((down, -right, ahead), abs=0.03)
+    reports = report_lines([path])
+    assert reports.photographs[str(path)].up == found

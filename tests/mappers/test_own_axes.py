@@ -1,0 +1,77 @@
+"""Images that seem to share a camera may be prints with axes of their own."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers import hypotheses
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.hypotheses import PER_IMAGE_CAMERAS, HypothesisTest
+from colmap_affrect.mappers.principal_points import FreedomGains
+
+APART = pycolmap.Reconstruction()
+"""The model with a camera for each image."""
+
+
+def tried(
+    monkeypatch: pytest.MonkeyPatch, gain: float, *, is_better: bool
+) -> tuple[HypothesisTest, Any]:
+    """Return a test of hypotheses after own axes were tried, and its search with own cameras.
+
+    Args:
+        monkeypatch: Of the test.
+        gain: Nats by which free axes fit better.
+        is_better: Whether the model with free axes scores higher.
+    """
+    grower = SimpleNamespace(remake=lambda _: APART)
+    own: Any = SimpleNamespace(
+        graph=SimpleNamespace(has_rigs=False),
+        grower=lambda _: grower,
+    )
+    gains = FreedomGains(
+        by_shifts=0.0,
+        by_crops=gain,
+        num_freed=6,
+        num_observations=1000,
+    )
+    monkeypatch.setattr(hypotheses, "with_free_principal_points", lambda *_: "free")
+    monkeypatch.setattr(hypotheses, "gains_of_freedom", lambda *_: gains)
+    monkeypatch.setattr(HypothesisTest, "_take_shifted_axes", lambda *_: is_better)
+    test = HypothesisTest.__new__(HypothesisTest)
+    test.task = SimpleNamespace(cameras={})  # type: ignore[assignment]
+    test.search = "shared"  # type: ignore[assignment]
+    test.per_image = own
+    test.best = [MappedModel(pycolmap.Reconstruction(), axis_turns_deg={"a.jpg": 3.0})]
+    test._try_own_shifted_axes()
+    return test, own
+
+
+def test_prints_that_seem_to_share_a_camera_get_axes_of_their_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    test, own = tried(monkeypatch, 500.0, is_better=True)
+    assert test.search is own
+    assert test.per_image is None
+    assert PER_IMAGE_CAMERAS in test.best[0].hypotheses
+    assert test.best[0].reconstruction is APART
+    assert not test.best[0].axis_turns_deg  # free axes have none
+
+
+@pytest.mark.parametrize(
+    ("gain", "is_better"),
+    [
+        (10.0, True),
+        (500.0, False),
+    ],
+)
+def test_a_shared_camera_stays_where_own_axes_bring_little(
+    monkeypatch: pytest.MonkeyPatch, gain: float, *, is_better: bool
+) -> None:
+    test, own = tried(monkeypatch, gain, is_better=is_better)
+    assert test.search == "shared"
+    assert test.per_image is own
+    assert test.best[0].axis_turns_deg == {"a.jpg": 3.0}
