@@ -42,6 +42,14 @@ def scene(tmp_path: Path, num_images: int = 5) -> tuple[MappedModel, MappingTask
     return MappedModel(model), MappingTask(path, tmp_path, cameras=records)
 
 
+def set_focal_length(task: MappingTask, camera_id: int, focal_px: float) -> None:
+    """Write another focal length into the database."""
+    with open_database(task.database_path) as database:
+        camera = database.read_camera(camera_id)
+        camera.params = [focal_px, *camera.params[1:]]
+        database.update_camera(camera)
+
+
 def last(mapped: MappedModel) -> pycolmap.Image:
     return mapped.reconstruction.images[max(mapped.reconstruction.reg_image_ids())]
 
@@ -473,6 +481,7 @@ def test_given_focal_lengths_are_doubted_where_the_points_say_others(
         focal_px=factor * 1500.0,
         given=("focal", "distortion"),
     )
+    set_focal_length(task, 1, record.focal_px)
     found = features_of(mapped, replace(task, cameras={1: record}))
     fitting = {one.fitting_focal_px for one in found.values()}
     assert len(fitting) == 1
@@ -497,6 +506,7 @@ def test_distortion_does_not_hide_that_a_given_focal_length_is_wrong(
     record = replace(
         task.cameras[1], source="given", focal_px=focal_px, given=("focal",)
     )
+    set_focal_length(task, 1, focal_px)
     found = features_of(mapped, replace(task, cameras={1: record}))[
         "2.jpg"
     ].fitting_focal_px
@@ -509,10 +519,8 @@ def test_a_focal_length_that_has_left_what_exif_says_costs_by_its_deviation(
     mapped, task = scene(tmp_path)
     name = last(mapped).name
     before = features_of(mapped, task)[name].log_likelihood_ratio
-    with open_database(task.database_path) as database:
-        camera = database.read_camera(last(mapped).camera_id)
-        camera.params = [1.1 * camera.params[0], *camera.params[1:]]
-        database.update_camera(camera)
+    camera = last(mapped).camera
+    set_focal_length(task, camera.camera_id, 1.1 * camera.mean_focal_length())
     moved = features_of(mapped, replace(task, graphs={}))[name].log_likelihood_ratio
     expected = 0.5 * (math.log(1.1) / EXIF_SIGMA) ** 2
     assert before - moved == pytest.approx(expected, rel=1e-3)
