@@ -86,6 +86,12 @@ class Progress:
     forecast: Forecast | None = None
     voice: Voice = field(default_factory=Voice)
 
+    def __post_init__(self) -> None:
+        if self.stream is not None and not hasattr(self.stream, "write"):
+            raise OptionError(
+                "give None or a stream, as sys.stderr", where=f"stream={self.stream!r}"
+            )
+
     @classmethod
     def given(cls, progress: "GivenProgress") -> "Progress":
         """Return what the argument ``progress`` of a function asks for.

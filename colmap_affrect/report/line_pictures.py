@@ -21,6 +21,7 @@ from colmap_affrect.geometry.vanishing import CHANCE
 from colmap_affrect.images import reading
 from colmap_affrect.images.lines import lines_of
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.image_failures import (
     ImageFailure,
     failure_of,
@@ -106,7 +107,7 @@ def camera_from_lines(
     gray = (
         _gray_values(image)
         if isinstance(image, np.ndarray)
-        else read_gray(as_path(image))
+        else read_gray(as_path(image, "image"))
     )
     if mask is not None and mask.shape != gray.shape:
         raise OptionError(
@@ -116,6 +117,7 @@ def camera_from_lines(
     return line_report(found, (gray.shape[1], gray.shape[0]))
 
 
+@checks_arguments
 def report_lines(
     paths: Sequence[PathLike], output_path: PathLike | None = None
 ) -> LineReports:
@@ -129,7 +131,7 @@ def report_lines(
         What the lines say, and why photographs cannot be read.
 
     Raises:
-        OptionError: a picture is there already.
+        OptionError: the paths are none, or a picture is there already.
         WorkspaceError: a picture cannot be written.
     """
     folder = as_path_or_none(output_path, "output_path")
