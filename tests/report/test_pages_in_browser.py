@@ -165,6 +165,21 @@ def test_the_dialog_has_the_figures_of_a_photograph(browser: Browser) -> None:
     assert browser.run(SELECTED) == "1"
 
 
+@pytest.mark.parametrize("size", [(390, 420), (1400, 420)])
+def test_buttons_of_the_dialog_are_seen_without_scrolling(
+    browser: Browser, size: tuple[int, int]
+) -> None:
+    browser.resize(*size)
+    browser.click("#sheet [data-open='0']")
+    browser.run("document.querySelector('#photo').scrollTop = 0")
+    ends = """return [...document.querySelectorAll("#photo > .buttons button")]
+        .filter((one) => one.offsetParent)
+        .map((one) => one.getBoundingClientRect().bottom)"""
+    bottoms = browser.run(ends)
+    assert len(bottoms) >= 4
+    assert max(bottoms) < size[1]
+
+
 def test_the_dialog_leads_to_what_two_share_and_to_the_tools(browser: Browser) -> None:
     browser.click("header [data-open='1']")
     browser.click("#photo [data-pair]")
@@ -394,6 +409,7 @@ def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
 
 MAX_NUM_PRINTED = 4  # pages of a run of ten photographs
 PRINTED_PX = 680  # width of A4 without its margins
+MAX_PRINTED_PX = 16.1  # size of letters of headings, 12 points
 
 
 def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
@@ -407,4 +423,10 @@ def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
     browser.command("Emulation.setEmulatedMedia", media="print")
     width = "return document.documentElement.scrollWidth"
     assert browser.run(width) <= PRINTED_PX
+    sizes = """return [...document.querySelectorAll(".note, .command, .legend, h2, .tiles dt")]
+        .filter((one) => one.offsetParent)
+        .map((one) => parseFloat(getComputedStyle(one).fontSize))"""
+    assert max(browser.run(sizes)) <= MAX_PRINTED_PX
+    heading = "return document.querySelector('#tie-points h2').offsetParent === null"
+    assert browser.run(heading), "nothing is below it on paper"
     browser.command("Emulation.setEmulatedMedia", media="")
