@@ -365,6 +365,25 @@ def test_pages_fit_and_are_readable(browser: Browser, scheme: str, width: int) -
     assert_fits_and_is_readable(browser, scheme, width)
 
 
+@pytest.mark.parametrize("width", [390, 1400])
+def test_long_names_are_shortened_where_photographs_are_chosen(
+    browser: Browser, width: int
+) -> None:
+    browser.resize(width)
+    lengthen = """const name = "2679C386-1DC0-4443-81B5-93D7EDE4AB37-83120.jpg ".repeat(3);
+        for (const one of document.querySelectorAll(".ref, option")) one.textContent = name;"""
+    browser.run(lengthen)
+    assert_fits_and_is_readable(browser, "light", width)
+    sizes = """return [...document.querySelectorAll(".ref, select")]
+        .filter((one) => one.offsetParent)
+        .map((one) => one.getBoundingClientRect())
+        .map(({ width, height }) => [width, height])"""
+    widths, heights = zip(*browser.run(sizes), strict=True)
+    assert max(widths) <= 0.86 * width
+    assert max(widths) <= 330
+    assert max(heights) <= 42
+
+
 def test_no_table_scrolls_on_a_phone(browser: Browser) -> None:
     browser.resize(390)
     table = "const table = document.querySelector('.scroll');"
