@@ -171,7 +171,7 @@ def test_buttons_of_the_dialog_are_seen_without_scrolling(
 ) -> None:
     browser.resize(*size)
     browser.click("#sheet [data-open='0']")
-    browser.run("document.querySelector('#photo').scrollTop = 0")
+    assert browser.run("return document.querySelector('#photo').scrollTop") == 0
     ends = """return [...document.querySelectorAll("#photo > .buttons button")]
         .filter((one) => one.offsetParent)
         .map((one) => one.getBoundingClientRect().bottom)"""
