@@ -384,6 +384,15 @@ def test_long_names_are_shortened_where_photographs_are_chosen(
     assert max(heights) <= 42
 
 
+def test_the_classes_of_photographs_are_one_bar_on_a_phone(browser: Browser) -> None:
+    browser.resize(390)
+    tops = """return [...document.querySelectorAll(".quality-bar span")]
+        .map((one) => one.getBoundingClientRect().top)"""
+    found = browser.run(tops)
+    assert len(found) == 4
+    assert max(found) == min(found)
+
+
 def test_no_table_scrolls_on_a_phone(browser: Browser) -> None:
     browser.resize(390)
     table = "const table = document.querySelector('.scroll');"
