@@ -1,5 +1,6 @@
 """Progress of long stages: a tqdm bar, lines or silence."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -21,6 +22,7 @@ NUM_PLAIN_LINES = 10  # display
 # twice as long after each of them, up to the longest
 QUIET_S = 4.0
 LONGEST_QUIET_S = 60.0  # Display
+USUAL_SIZE = (80, 24)  # columns and rows of a terminal; display
 
 
 class Voice:
@@ -85,6 +87,12 @@ class Progress:
     title: str = ""
     forecast: Forecast | None = None
     voice: Voice = field(default_factory=Voice)
+
+    def __post_init__(self) -> None:
+        if self.stream is not None and not hasattr(self.stream, "write"):
+            raise OptionError(
+                "give None or a stream, as sys.stderr", where=f"stream={self.stream!r}"
+            )
 
     @classmethod
     def given(cls, progress: "GivenProgress") -> "Progress":
@@ -155,7 +163,15 @@ class Progress:
     def _bar(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show a stage as a bar; yield what is called with the number of units done."""
         title = self.title + name
-        bar = tqdm(total=total, desc=title, unit=unit, file=self.stream)
+        columns, rows = self._size() or (None, None)
+        bar = tqdm(
+            total=total,
+            desc=title,
+            unit=unit,
+            file=self.stream,
+            ncols=columns,
+            nrows=rows,
+        )
 
         def advance(count: int) -> None:
             if self.forecast:
@@ -169,6 +185,14 @@ class Progress:
 
         with bar, _refresh_each_second(bar, self.voice, title, show_forecast):
             yield advance
+
+    def _size(self) -> tuple[int, int] | None:
+        """Return columns and rows where a terminal says 0, as in containers; None elsewhere."""
+        try:
+            columns = os.get_terminal_size(self.file_number).columns
+        except OSError:  # a notebook
+            return None
+        return None if columns else USUAL_SIZE
 
     def _lines(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show a stage as lines; yield what is called with the number of units done."""

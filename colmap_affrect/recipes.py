@@ -305,7 +305,7 @@ def load_recipe(
     ``section=name`` chooses another part, with its defaults.
     Raises OptionError for an unknown recipe or option, or a value out of range.
     """
-    name = name if isinstance(name, str) else str(as_path(name))
+    name = name if isinstance(name, str) else str(as_path(name, "name"))
     values = _read_recipe(name)
     changed = with_settings(
         values, [settings] if isinstance(settings, str) else settings

@@ -214,6 +214,13 @@ REFUSED: list[tuple[str, str]] = [
     ("align('a', 'b', distance=[])", "unknown option 'distance' (did you mean 'distances'?)"),
     ("diagnose(3)", "path=3: give a path as str or os.PathLike, not int"),
     ("load_recipe('default', 'rectifier')", "set rectifier: expected OPTION=VALUE"),
+    ("load_recipe(3)", "name=3: give a path as str or os.PathLike, not int"),
+    ("report_lines('a.jpg')", "paths: 'a.jpg' is str; give Sequence[str or PathLike[str]]"),
+    ("camera_from_lines(3)", "image=3: give a path as str or os.PathLike, not int"),
+    ("extract_features('a.db', 'b', 'c.jpg')",
+     "image_names: 'c.jpg' is str; give Iterable[str or PathLike[str]]"),
+    ("match_feature_sets({}, progress=3)", "progress: 3 is int; give Progress or bool or None"),
+    ("Progress(3)", "stream=3: give None or a stream, as sys.stderr"),
 ]  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import threading
 from collections.abc import Callable
@@ -34,6 +35,23 @@ from colmap_affrect.progress import (
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+def test_a_terminal_that_does_not_say_how_wide_it_is_has_bars(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reading, writing = os.openpty()
+    terminal = os.fdopen(writing, "w")
+    monkeypatch.setattr("sys.stderr", terminal)
+    with Progress(terminal).stage("match", 4, "pairs") as advance:
+        advance(4)
+    shown = b""
+    while b"\n" not in shown:
+        shown += os.read(reading, 10_000)
+    terminal.close()
+    os.close(reading)
+    assert b"match: 100%" in shown
 
 
 def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> (

@@ -91,10 +91,10 @@ def conclusion(comparison: Comparison) -> str:
     more = number_text(abs(difference), 1)
     photographs = "photograph" if more == "1" else "photographs"
     if difference >= MIN_DIFFERENCE:
-        text = f"{best.name} places {more} {photographs} more {how} than {whose}"
+        text = f"{best.name} {how} places {more} more {photographs} than {whose}"
         return f"{text}, in {times}."
     if difference <= -MIN_DIFFERENCE:
-        text = f"{whose} does better here: it places {more} {photographs} more {how}"
+        text = f"{whose} does better here: it {how} places {more} more {photographs}"
         return f"{text}; {best.name} takes {times}."
     num_trusted = number_text(colmap.trusted.mean, 1)
     return (

@@ -44,6 +44,7 @@ from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, GivenProgress, Progress
+from colmap_affrect.project.argument_types import require_type
 from colmap_affrect.project.outputs import new_results, temporary_folder
 from colmap_affrect.project.paths import PathLike, as_path, as_path_or_none
 from colmap_affrect.project.stage_report import StageReport
@@ -132,6 +133,7 @@ def extract_features(  # noqa: PLR0913 (arguments are those of pycolmap)
         masks=masks,
     )
     recipe, asked = translate.extraction_recipe(extraction_options)
+    require_type("image_names", image_names, kind=Iterable[PathLike])
     shown = _Cancellable(Progress.given(progress), cancellation_token)
     with _context(database_path, device, asked, weights_path, shown) as context:
         report = extract(context, inputs, recipe, image_names=list(image_names))

@@ -37,7 +37,7 @@ SENTENCES: dict[DoubtCode, str] = {
     "matches_disagree": "most of its matches disagree with this position",
     "little_agreement": "only {percent}% of the matches of its pairs agree with the model",
     "no_three_view_points": "none of its points is seen by two other photographs",
-    "few_three_view_points": "only {num} of its points are seen by two other photographs",
+    "few_three_view_points": "only {num} of its points could be found in two other photographs",
     "focal_unknown": "any focal length fits, and the position of the camera depends on that",
     "focal_contradicted": (
         "the given focal length does not fit, {given_px:.0f} px: {fitting_px:.0f} px does"

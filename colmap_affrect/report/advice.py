@@ -448,7 +448,7 @@ def _of_effort(case: _Case) -> list[Advice]:
         return []
     minutes = sum(one.core_s for one in case.untried) / available_cores() / 60
     levels = ", ".join(one.text() for one in case.untried)
-    why = f"not tried, at most about {max(1, round(minutes))} min more: {levels}"
+    why = f"more matching, at most about {max(1, round(minutes))} min: {levels}"
     greater = EFFORT_NAMES[EFFORT_NAMES.index(case.effort) + 1]
     if context.command[1:2] != ("run",):
         why += f"; give the command of the run again, with --effort {greater}"

@@ -23,6 +23,7 @@ from colmap_affrect.images import reading
 from colmap_affrect.images.lines import lines_of
 from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.options import Summarized, documented
+from colmap_affrect.project.argument_types import checks_arguments
 from colmap_affrect.project.image_failures import (
     ImageFailure,
     failure_of,
@@ -118,7 +119,7 @@ def camera_from_lines(
     if isinstance(image, np.ndarray):
         gray = _gray_values(image)
     else:
-        path = as_path(image)
+        path = as_path(image, "image")
         gray = read_gray(path)
         down = picture_down(path)
     if mask is not None and mask.shape != gray.shape:
@@ -129,6 +130,7 @@ def camera_from_lines(
     return line_report(found, (gray.shape[1], gray.shape[0]))
 
 
+@checks_arguments
 def report_lines(
     paths: Sequence[PathLike], output_path: PathLike | None = None
 ) -> LineReports:
@@ -143,8 +145,8 @@ def report_lines(
         What the lines say, and why photographs cannot be read.
 
     Raises:
-        OptionError: a picture is there already, or would lie among the photographs; nothing
-            is measured then.
+        OptionError: the paths are none, or a picture is there already, or would lie among
+            the photographs; nothing is measured then.
         WorkspaceError: a picture cannot be written.
     """
     folder = as_path_or_none(output_path, "output_path")

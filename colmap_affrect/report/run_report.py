@@ -101,8 +101,9 @@ class RunReport(ReconstructionReport):
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: counts, photographs, what to try next."""
+        which = "largest model" if len(self.models) > 1 else "model"
         counts = {
-            "photographs in the model": f"{len(self.registered_names)} of {self.images_total}",
+            f"photographs in the {which}": f"{len(self.registered_names)} of {self.images_total}",
             "verified pairs": f"{self.num_verified_pairs:,} of {self.num_pairs:,}",
         }
         if self.models:

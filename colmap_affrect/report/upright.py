@@ -53,8 +53,9 @@ def upright_of_run(model_path: Path, model: pycolmap.Reconstruction) -> Upright 
     if not workspace.features.exists():
         return None
     try:
+        mapped = workspace.mapping_record
         # A model that extends another one keeps the frame of that
-        if " " in workspace.input_digest("map"):
+        if mapped is not None and mapped.extends:
             return None
         return _upright(model, FeatureStore(workspace.features))
     except AffrectError as error:

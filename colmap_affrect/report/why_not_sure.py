@@ -7,6 +7,10 @@ from colmap_affrect.project.reasons import SENTENCES, Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 
 Value = int | float | str
+NO_PLACE = (
+    "not registered: it matches others, the best with {num_inliers} inliers, but no position "
+    "that these agree on was found"
+)
 
 
 @dataclass(frozen=True)
@@ -49,21 +53,33 @@ def groups_of(
         Reasons, those of most photographs first.
     """
     doubts = _doubts_by_name(models, unregistered)
-    fates = dict[str, list[int]]()
     by_kind = dict[tuple[Value, ...], list[tuple[int, Doubt]]]()
     for number, name in enumerate(names):
-        missing = unregistered.get(name)
-        if name not in doubts and missing and not missing.model:
-            fates.setdefault(missing.fate(), []).append(number)
         for doubt in doubts.get(name, ()):
             by_kind.setdefault(_kind(doubt), []).append((number, doubt))
     found = []
     for members in by_kind.values():
         text = _text([doubt for _, doubt in members])
         found.append(Group(text, tuple(number for number, _ in members)))
-    for fate, numbers in fates.items():
-        found.append(Group(fate, tuple(numbers)))
+    lost = {name: why for name, why in unregistered.items() if name not in doubts}
+    found += _groups_of_lost(names, lost)
     found.sort(key=lambda group: -len(group.photographs))
+    return found
+
+
+def _groups_of_lost(
+    names: Sequence[str], unregistered: Mapping[str, Missing]
+) -> list[Group]:
+    """Return what became of photographs that are in no model."""
+    fates = dict[str, list[tuple[int, Missing]]]()
+    for number, name in enumerate(names):
+        missing = unregistered.get(name)
+        if missing and not missing.model:
+            fates.setdefault(missing.fate(), []).append((number, missing))
+    found = []
+    for lost in fates.values():
+        text = _fate_text([missing for _, missing in lost])
+        found.append(Group(text, tuple(number for number, _ in lost)))
     return found
 
 
@@ -84,6 +100,15 @@ def _kind(doubt: Doubt) -> tuple[Value, ...]:
     """Return what doubts share that are told together: the code, and all words."""
     words = [value for value in doubt.values.values() if isinstance(value, str)]
     return (doubt.code, *words)
+
+
+def _fate_text(missing: Sequence[Missing]) -> str:
+    """Return what became of photographs, and why, where their matches say it."""
+    first = missing[0]
+    best = [max(one.partners.values(), default=0) for one in missing]
+    if first.code != "not_registered" or not all(best):
+        return first.fate()
+    return NO_PLACE.format(num_inliers=_Range(best))
 
 
 def _text(doubts: Sequence[Doubt]) -> str:

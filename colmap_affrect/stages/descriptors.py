@@ -25,7 +25,7 @@ from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
 from colmap_affrect.pairs.given_matches import GivenMatches, MatchType
 from colmap_affrect.pairs.lists import Pair, exhaustive_pairs, ordered_for_reuse
 from colmap_affrect.parallel.executor import available_cores, map_ordered
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import SILENT, GivenProgress, Progress
 from colmap_affrect.project.argument_types import checks_arguments
 
 # Values of the one kind of descriptors that whole numbers stand for; COLMAP's
@@ -64,7 +64,8 @@ def match_descriptors(
         "image 2": (keypoints2, descriptors2),
     }
     pair = ("image 1", "image 2")
-    return match_feature_sets(sets, pairs=[pair], options=options)[pair]
+    found = match_feature_sets(sets, pairs=[pair], options=options, progress=False)
+    return found[pair]
 
 
 @checks_arguments
@@ -73,7 +74,7 @@ def match_feature_sets(
     pairs: Iterable[Pair] | None = None,
     options: NearestOptions | None = None,
     *,
-    progress: Progress = SILENT,
+    progress: GivenProgress = None,
 ) -> dict[Pair, Matches]:
     """Match the features of several images that any program has found.
 
@@ -81,7 +82,7 @@ def match_feature_sets(
         features: keypoints (N, 2) in px and descriptors (N, D) of each image, by its name.
         pairs: names of the images to match; None: all pairs.
         options: of the matcher, mutual nearest neighbours with a ratio test.
-        progress: where to show progress.
+        progress: True, False, or None for where somebody looks at it.
 
     Returns:
         Matches by pair, see :func:`match_descriptors`.
@@ -97,7 +98,7 @@ def match_feature_sets(
     if unknown:
         raise OptionError("is in a pair, and has no features", where=min(unknown))
     found = dict[Pair, Matches]()
-    with progress.stage("match", len(listed), "pairs") as advance:
+    with Progress.given(progress).stage("match", len(listed), "pairs") as advance:
         matched = iterate_descriptor_matches(
             listed, lambda name: features[name], options
         )

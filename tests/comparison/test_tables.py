@@ -139,7 +139,7 @@ SLOW = replace(method("default", NAMES), wall_s={"extract": 17.0})
     [
         (
             [COLMAP, SLOW],
-            "default places 4 photographs more surely than COLMAP, in 2.1 times the time.",
+            "default surely places 4 more photographs than COLMAP, in 2.1 times the time.",
         ),
         (
             [SIFT, method("default", "abd")],
@@ -148,12 +148,12 @@ SLOW = replace(method("default", NAMES), wall_s={"extract": 17.0})
         ),
         (
             [COLMAP, SIFT, method("default", "a")],
-            "COLMAP does better here: it places 1 photograph more surely; default takes about "
+            "COLMAP does better here: it surely places 1 more photograph; default takes about "
             "the same time.",
         ),
         (
             [method("sift-colmap", "abc", correct="ab"), method("default", "abcd", correct="abd")],
-            "default places 1 photograph more correctly than COLMAP, in about the same time.",
+            "default correctly places 1 more photograph than COLMAP, in about the same time.",
         ),
         ([SIFT], ""),
         ([DEFAULT], ""),

@@ -19,6 +19,7 @@ from colmap_affrect.geometry.segments import Segments
 from colmap_affrect.interop.align import align
 from colmap_affrect.interop.export import export
 from colmap_affrect.project.feature_store import FeatureStore
+from colmap_affrect.project.record import ModelInputs
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.scene import read_view
 
@@ -103,7 +104,7 @@ def test_nothing_is_turned_where_nobody_knows(tmp_path: Path, case: str) -> None
     before = write_run(folder, evidence=2.0 if case == "by chance" else 20.0,
                        wrong=2 if case == "contradiction" else 0)  # fmt: skip
     if case == "extends":
-        Workspace(folder).record_input_digests(map="digest another-model")
+        Workspace(folder).record_mapping(ModelInputs("verified", extends="another"))
     if case == "no run":
         (folder / "features.h5").unlink()
     said = list[str]()

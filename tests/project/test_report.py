@@ -226,7 +226,7 @@ def test_summary_says_what_cannot_be_trusted() -> None:
     shaky = replace(SHAKY, probabilities={"a.png": 0.31, "č d.png": 0.9})
     text = replace(REPORT, models=(shaky,)).summary()
     assert (
-        "doubtful    a.png: only 9 of its points are seen by two other photographs\n"
+        "doubtful    a.png: only 9 of its points could be found in two other photographs\n"
         in text
     )
     line = "sure        1, unsure 0, doubtful 1; sure: right with 90% or more\n"

@@ -165,6 +165,21 @@ def test_the_dialog_has_the_figures_of_a_photograph(browser: Browser) -> None:
     assert browser.run(SELECTED) == "1"
 
 
+@pytest.mark.parametrize("size", [(390, 420), (1400, 420)])
+def test_buttons_of_the_dialog_are_seen_without_scrolling(
+    browser: Browser, size: tuple[int, int]
+) -> None:
+    browser.resize(*size)
+    browser.click("#sheet [data-open='0']")
+    assert browser.run("return document.querySelector('#photo').scrollTop") == 0
+    ends = """return [...document.querySelectorAll("#photo > .buttons button")]
+        .filter((one) => one.offsetParent)
+        .map((one) => one.getBoundingClientRect().bottom)"""
+    bottoms = browser.run(ends)
+    assert len(bottoms) >= 4
+    assert max(bottoms) < size[1]
+
+
 def test_the_dialog_leads_to_what_two_share_and_to_the_tools(browser: Browser) -> None:
     browser.click("header [data-open='1']")
     browser.click("#photo [data-pair]")
@@ -350,6 +365,34 @@ def test_pages_fit_and_are_readable(browser: Browser, scheme: str, width: int) -
     assert_fits_and_is_readable(browser, scheme, width)
 
 
+@pytest.mark.parametrize("width", [390, 1400])
+def test_long_names_are_shortened_where_photographs_are_chosen(
+    browser: Browser, width: int
+) -> None:
+    browser.resize(width)
+    lengthen = """const name = "2679C386-1DC0-4443-81B5-93D7EDE4AB37-83120.jpg ".repeat(3);
+        for (const one of document.querySelectorAll(".ref, option")) one.textContent = name;"""
+    browser.run(lengthen)
+    assert_fits_and_is_readable(browser, "light", width)
+    sizes = """return [...document.querySelectorAll(".ref, select")]
+        .filter((one) => one.offsetParent)
+        .map((one) => one.getBoundingClientRect())
+        .map(({ width, height }) => [width, height])"""
+    widths, heights = zip(*browser.run(sizes), strict=True)
+    assert max(widths) <= 0.86 * width
+    assert max(widths) <= 330
+    assert max(heights) <= 42
+
+
+def test_the_classes_of_photographs_are_one_bar_on_a_phone(browser: Browser) -> None:
+    browser.resize(390)
+    tops = """return [...document.querySelectorAll(".quality-bar span")]
+        .map((one) => one.getBoundingClientRect().top)"""
+    found = browser.run(tops)
+    assert len(found) == 4
+    assert max(found) == min(found)
+
+
 def test_no_table_scrolls_on_a_phone(browser: Browser) -> None:
     browser.resize(390)
     table = "const table = document.querySelector('.scroll');"
@@ -394,6 +437,7 @@ def test_what_is_printed_has_three_sides_of_the_model_and_no_buttons(
 
 MAX_NUM_PRINTED = 4  # pages of a run of ten photographs
 PRINTED_PX = 680  # width of A4 without its margins
+MAX_PRINTED_PX = 16.1  # size of letters of headings, 12 points
 
 
 def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
@@ -407,4 +451,10 @@ def test_a_small_run_is_printed_on_four_pages_and_nothing_is_cut(
     browser.command("Emulation.setEmulatedMedia", media="print")
     width = "return document.documentElement.scrollWidth"
     assert browser.run(width) <= PRINTED_PX
+    sizes = """return [...document.querySelectorAll(".note, .command, .legend, h2, .tiles dt")]
+        .filter((one) => one.offsetParent)
+        .map((one) => parseFloat(getComputedStyle(one).fontSize))"""
+    assert max(browser.run(sizes)) <= MAX_PRINTED_PX
+    heading = "return document.querySelector('#tie-points h2').offsetParent === null"
+    assert browser.run(heading), "nothing is below it on paper"
     browser.command("Emulation.setEmulatedMedia", media="")

@@ -227,6 +227,18 @@ def test_what_lost_photographs_matched_is_told_as_their_neighbours(
     assert data["neighbours"][4] == [[1, 31, "inliers"]]
 
 
+def test_figures_of_several_models_are_called_those_of_the_largest(
+    folder: Path, tmp_path: Path
+) -> None:
+    report = small_report(folder / "out")
+    both = replace(report, models=report.models * 2)
+    page = write_run_page(Workspace(tmp_path), both, RunContent(NAMES, {}))
+    which = "photographs in the largest model"
+    assert which in page.read_text(encoding="utf-8")
+    assert which in both._repr_html_()
+    assert which not in report._repr_html_()
+
+
 def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     report = small_report(tmp_path)
     values = {

@@ -56,3 +56,16 @@ def test_lost_photographs_are_with_what_took_them_out_or_what_became_of_them() -
     found = groups_of(NAMES, (model,), missing)
     assert [group.photographs for group in found] == [(0, 1), (2, 3)]
     assert found[1].text == "no features"
+
+
+def test_photographs_that_match_and_are_lost_are_told_with_their_best_matches() -> None:
+    model = ModelSummary(("a.jpg",), 9, 3.0, 0.5)
+    missing = {
+        "b.jpg": Missing("not_registered", partners={"a.jpg": 281, "c.jpg": 30}),
+        "c.jpg": Missing("not_registered", partners={"b.jpg": 30}),
+    }
+    (group,) = groups_of(NAMES, (model,), missing)
+    assert group.photographs == (1, 2)
+    assert "the best with 30 to 281 inliers" in group.text
+    alone = {"b.jpg": Missing("not_registered")}
+    assert groups_of(NAMES, (model,), alone) == [Group("not registered", (1,))]

@@ -694,8 +694,8 @@ def test_advice_names_what_was_not_tried_and_the_command_that_goes_on(
     context = Context(workspace, command=(*words, "--effort", "normal"))
     found = advice(context, [NAMES[0]], report.models, 0, left, "normal")
     more = found[-3]  # tie points and other photographs are more work
-    assert more.why.startswith("not tried, at most about ")
-    assert more.why.endswith(" min more: all tilts 28 pairs, new 1 pair")
+    assert more.why.startswith("more matching, at most about ")
+    assert more.why.endswith(" min: all tilts 28 pairs, new 1 pair")
     assert shlex.split(more.command) == [*words, "--effort", "high"]
     low = replace(context, command=words)
     (more,) = advice(low, [], report.models, 0, left, "low")

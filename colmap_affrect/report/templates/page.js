@@ -52,6 +52,7 @@ const page = (() => {
     marks.hidden = !(shared.markIn && data.tie_points.photographs[opened]);
     covers.hidden = !(shared.masks && data.tie_points.photographs[opened]);
     if (!dialog.open) dialog.showModal();
+    dialog.scrollTop = 0; // the button that has the keys may be far below the photograph
   }
 
   // The photographs that it shares most with; a click shows what.
@@ -59,7 +60,8 @@ const page = (() => {
     shares.hidden = !(others.length && shared.showPair);
     const buttons = others.map(([index, count, kind]) => {
       const button = document.createElement("button");
-      Object.assign(button, { type: "button", textContent: `${label(index)}: ${count} ${kind}` });
+      const what = count === 1 ? kind.slice(0, -1) : kind;
+      Object.assign(button, { type: "button", textContent: `${label(index)}: ${count} ${what}` });
       button.dataset.pair = index;
       return button;
     });

@@ -361,7 +361,7 @@
       const size = this.width / this.image?.width;
       this.readout.textContent = [
         `Point ${current}: ${mark ? `x ${mark.x.toFixed(2)}, y ${mark.y.toFixed(2)}` : "no mark here"}${this.hint(mark)}.`,
-        `Marks: ${here.length}, also in two other photographs: ${here.filter(isTied).length}.`,
+        here.length ? `Points marked here: ${here.length}, ${here.filter(isTied).length} of them in two other photographs, too.` : "",
         size > 1.01 ? `Open the original to mark precisely: 1 px here is ${size.toFixed(1)} px of it.` : "",
         this.image ? "" : "No picture: open the original.",
       ].join(" ");

@@ -401,8 +401,10 @@
         context.lineWidth = 3 * density;
         context.strokeStyle = style.getPropertyValue("--ground");
         context.fillStyle = style.getPropertyValue("--text");
-        context.strokeText(text, (x + 4) * density, (y - 4) * density);
-        context.fillText(text, (x + 4) * density, (y - 4) * density);
+        const last = context.canvas.width - context.measureText(text).width;
+        const place = [Math.min((x + 4) * density, last), (y - 4) * density];
+        context.strokeText(text, ...place);
+        context.fillText(text, ...place);
       }
     }
 
