@@ -272,25 +272,3 @@ def test_gains_are_those_of_crops_and_of_shifts_up_and_down(
     num_observations = truth.compute_num_observations()
     assert gains == FreedomGains(20.0, 30.0, 3, num_observations)
     assert gains_of_freedom(truth, free, free).num_freed == 0
-
-
-@pytest.mark.parametrize(("share", "contradict"), [(0.15, False), (1.0, True)])
-def test_axes_of_whole_photographs_are_not_just_in_the_middle(
-    tmp_path: Path, share: float, *, contradict: bool
-) -> None:
-    """Off by up to two per cent they move points by many deviations, and are usual."""
-    path = tmp_path / "database.db"
-    truth = synthesize(
-        path,
-        num_rigs=NUM_IMAGES,
-        num_points3D=400,
-        noise_px=NOISE_PX,
-        camera_params=PARAMS,
-    )
-    for image in truth.images.values():
-        for point in image.points2D:
-            point.xy = point.xy + share * OFFSETS_PX[image.image_id - 1]
-    constant, free = searches_of(path, records_of(truth, UNKNOWN))
-    gains = gains_of_freedom(truth, constant, free)
-    assert gains.num_freed == NUM_IMAGES
-    assert gains.contradict_constant == contradict
