@@ -55,8 +55,8 @@ SENTENCES: dict[DoubtCode, str] = {
         "{sigma_deg:.0f} degrees"
     ),
     "axis_unclear": (
-        "points say that optical axes are off the middle of photographs, but not where: its "
-        "rotation may be off by {turn_deg:.0f} degrees"
+        "points do not tell where the optical axes of photographs are: its rotation may be off by "
+        "{turn_deg:.0f} degrees"
     ),
     "camera_shared": (
         "photographs of its size are taken for those of one camera: with cameras of their own, "
