@@ -1,5 +1,6 @@
 """Which pairs of a run a person should look at, and why."""
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -91,6 +92,28 @@ def pairs_to_check(
             if pair in reasons or len(reasons) < MAX_NUM_PAIRS:
                 reasons.setdefault(pair, []).append(candidate.text)
     return {pair: "; ".join(texts) for pair, texts in reasons.items()}
+
+
+def backed_pairs(agreement: Mapping[Pair, float]) -> set[Pair]:
+    """Return the pairs that the rest of a model speaks for: nobody needs to reject them.
+
+    A pair that alone ties two parts, or a photograph, agrees with the model whether it is right or
+    not.
+
+    Args:
+        agreement: share of the inliers that agrees with the model, of verified pairs.
+
+    Returns:
+        Pairs of which most inliers agree, and without which the model would still be one; names
+        in order.
+    """
+    agreeing = [pair for pair, share in agreement.items() if share >= MIN_AGREEMENT]
+    num_pairs = Counter(name for pair in agreeing for name in pair)
+    of_others = set[Pair]()
+    for first, second in agreeing:
+        if min(num_pairs[first], num_pairs[second]) > 1:
+            of_others.add((min(first, second), max(first, second)))
+    return of_others.difference(lone_ties(agreeing))
 
 
 def _strongest_pairs(

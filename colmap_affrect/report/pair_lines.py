@@ -31,8 +31,9 @@ MOST = 65_535  # of a uint16
 class PairLines:
     """Lines of pairs."""
 
-    # Numbers of the two photographs, number of lines, and what is known of the pair
-    pairs: list[tuple[int, int, int, str]] = field(default_factory=list)
+    # Numbers of the two photographs, number of lines, what is known of the pair, and whether the
+    # rest of the model speaks for it
+    pairs: list[tuple[int, int, int, str, bool]] = field(default_factory=list)
     # Base64: (L, 4) uint16 x and y in both photographs, 65535 at the right and lower border, then
     # (L,) uint8 kinds
     lines: str = ""
@@ -126,7 +127,7 @@ class LinesOfRun:
             ends.append(_ends(matched, rows))
             kinds.append(matched.kinds[rows].astype(np.uint8))
             numbers = (self._index[pair[0]], self._index[pair[1]])
-            found.pairs.append((*numbers, len(rows), matched.text))
+            found.pairs.append((*numbers, len(rows), matched.text, matched.is_backed))
         data = np.concatenate(ends).tobytes() + np.concatenate(kinds).tobytes()
         return PairLines(found.pairs, base64_text(data))
 

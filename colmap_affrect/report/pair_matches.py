@@ -14,6 +14,7 @@ from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.geometry.arrays import Array, Indices, rows_in
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.report.pair_choice import backed_pairs
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
 from colmap_affrect.stages.map import agreements
@@ -43,6 +44,7 @@ class MatchedPair:
     points: list[Array]  # (N, 2) px from the upper left corner of each photograph
     kinds: Indices  # (N,) values of MatchKind
     text: str  # how many there are, of which level, and how many agree with the model
+    is_backed: bool = False  # by the rest of the model
 
 
 class PairReader:
@@ -67,6 +69,7 @@ class PairReader:
         )
         # Share of inliers, by verified pair
         self.agreement = agreements(self.graph, self.model)
+        self._backed = backed_pairs(self.agreement)
         self._stored_kinds = lru_cache(NUM_KEPT)(self._read_stored_kinds)
         self._keypoints = lru_cache(NUM_KEPT)(self._read_keypoints)
         # Of pairs whose matches are stored, those that were looked up
@@ -120,6 +123,7 @@ class PairReader:
                 ]
             ),
             self._text(names, len(raw), len(inliers)),
+            (min(names), max(names)) in self._backed,
         )
 
     def look_up_levels(self, pairs: Iterable[Pair]) -> None:

@@ -78,7 +78,7 @@ class PairPicture:
     names: Pair
     why: str  # it is shown
     text: str  # what is known of its matches
-    option: str  # for a command that leaves it out
+    option: str  # for a command that leaves it out; none where the model speaks for the pair
     picture: Picture
 
 
@@ -211,6 +211,8 @@ def draw_pairs_to_check(
             pair = reader.read(names)
             drawn = draw_matches(pair, [photograph(name) for name in names])
             picture = Picture.from_image(shrink_to(drawn, 2 * SIDE_PX))
-            option = shlex.join(["--reject-pair", as_row(names)])
+            option = ""
+            if not pair.is_backed:
+                option = shlex.join(["--reject-pair", as_row(names)])
             pictures.append(PairPicture(names, why, pair.text, option, picture))
     return pictures

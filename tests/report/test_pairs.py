@@ -30,7 +30,7 @@ from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.reasons import Doubt, Missing
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.report import pairs
-from colmap_affrect.report.pair_choice import pairs_to_check
+from colmap_affrect.report.pair_choice import backed_pairs, pairs_to_check
 from colmap_affrect.report.pair_lines import (
     MAX_NUM_PAIRS,
     MAX_NUM_PAIRS_IN_FILES,
@@ -317,6 +317,16 @@ def test_of_many_pairs_twelve_are_shown_and_without_a_model_the_missing_ones(
     assert pairs_to_check(without, verified, {}) == {
         ("006.jpg", "007.jpg"): "007.jpg is missing"
     }
+
+
+def test_what_ties_two_parts_or_a_photograph_alone_is_not_backed_by_the_model() -> None:
+    triangles = [*combinations("abc", 2), *combinations("fed", 2)]
+    agreement = dict.fromkeys([*triangles, ("d", "c"), ("g", "f")], 0.9)
+    agreement[("a", "f")] = 0.4
+    backed = {*combinations("abc", 2), *combinations("def", 2)}
+    assert backed_pairs(agreement) == backed
+    agreement[("a", "f")] = 0.6
+    assert backed_pairs(agreement) == backed | {("a", "f"), ("c", "d")}
 
 
 def test_a_pair_of_long_names_and_of_a_read_only_folder_is_drawn(

@@ -74,8 +74,8 @@
     const values = new Uint16Array(buffer, 0, 4 * total);
     const kinds = new Uint8Array(buffer, 8 * total);
     let start = 0;
-    for (const [one, two, count, text] of pairs) {
-      const found = { values, kinds, start, count, text };
+    for (const [one, two, count, text, isBacked] of pairs) {
+      const found = { values, kinds, start, count, text, isBacked };
       known.set(`${one} ${two}`, { ...found, isTurned: false });
       known.set(`${two} ${one}`, { ...found, isTurned: true });
       start += count;
@@ -160,6 +160,7 @@
 
   function textOf(one, two) {
     const lines = known.get(`${one} ${two}`);
+    if (lines?.isBacked) return `${lines.text}; ${lines.count} of them are drawn.`;
     if (lines) return `${lines.text}; ${lines.count} of them are drawn. Where they are wrong, run again with:`;
     const isComplete = !data.num_pairs_left_out || countOf(one, two) === 0;
     return isComplete ? "They share no verified match. What was rejected, if anything, is drawn by:" : "They share matches that this page leaves out; the command below draws them.";
@@ -189,6 +190,7 @@
     figure.hidden = false;
     canvas.setAttribute("aria-label", `Matches of ${label(one)} and ${label(two)}`);
     figure.querySelector(".readout").textContent = text;
+    figure.querySelector("code").hidden = Boolean(lines?.isBacked);
     figure.querySelector("code").textContent = lines
       ? `--reject-pair ${forShell(names.map(asCell).join())}`
       : `colmap-affrect show-pair OUT ${names.map(forShell).join(" ")}`;
