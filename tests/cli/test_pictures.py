@@ -37,7 +37,8 @@ def test_inspect_draws_a_sheet(tmp_path: Path, call: Call) -> None:
 
 
 def test_lines_go_on_past_what_cannot_be_read(tmp_path: Path, call: Call) -> None:
-    bad = tmp_path / "bad.jpg"
+    bad = tmp_path / "photographs" / "bad.jpg"
+    bad.parent.mkdir()
     bad.write_bytes(b"no image")
     out = tmp_path / "pictures"
     done = call("lines", bad, FACADE, "--output-path", out)
