@@ -44,6 +44,8 @@ NUM_STRONGEST = 10  # pairs that are looked at for depth; resource
 MIN_GAIN = 0.05  # of a probability, by more matches
 CONTRADICTED: Collection[DoubtCode] = ("matches_disagree", "little_agreement")
 """Doubts of photographs whose matches are rather wrong than few."""
+OF_ANOTHER_PLACE: Collection[DoubtCode] = ("other_surroundings", "two_places")
+"""Doubts of photographs that were cut from a model, to which nothing else ties them."""
 GIVEN_FOCAL_FLAGS: Collection[str] = (
     "--focal-length-px",
     "--focal-mm",
@@ -350,12 +352,13 @@ def _of_other_features(case: _Case) -> list[Advice]:
 def _of_tie_points(case: _Case) -> list[Advice]:
     context = case.context
     is_ours = context.mapping.name == MAPPERS.default
-    if not (case.lost and is_ours) or case.shows_no_depth:
+    lost = [name for name in case.lost if not _is_of_another_place(case, name)]
+    if not (lost and is_ours) or case.shows_no_depth:
         return []
     table = context.by_hand.tie_points_path
     place = "at Tie points by hand in report.html"
     if len(case.model.likely) > 1:
-        why = f"mark six points or more of {such_as(case.lost)}"
+        why = f"mark six points or more of {such_as(lost)}"
         why += f" in two photographs of the model too, {place}"
         if len(case.models) > 1:
             why += "; seven, each in two photographs of both, join two models"
@@ -366,6 +369,12 @@ def _of_tie_points(case: _Case) -> list[Advice]:
         why = f"no point of {table.name} is seen by two photographs of one model: {why}"
     command = again(context, "--tie-points", str(table or "tie-points.csv"))
     return [Advice("tie_points", why, command)]
+
+
+def _is_of_another_place(case: _Case, name: str) -> bool:
+    """Tell whether a photograph was found to show another place than the largest model."""
+    doubts = case.model.taken_out.get(name, ())
+    return any(doubt.code in OF_ANOTHER_PLACE for doubt in doubts)
 
 
 def _of_unknown_focal(case: _Case) -> list[Advice]:

@@ -39,7 +39,7 @@ from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project import feature_store
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_store import pair_key
-from colmap_affrect.project.reasons import Doubt
+from colmap_affrect.project.reasons import Doubt, DoubtCode
 from colmap_affrect.project.report import (
     Bridge,
     MatchedAgain,
@@ -331,6 +331,17 @@ def test_tie_points_that_join_nothing_are_advised_again_with_the_reason(
     (_, tie_points, _) = advice(given, [LOST], [model, model], 0)
     assert tie_points.why.endswith("join two models")
     assert tie_points.command == "colmap-affrect map --tie-points t.csv"
+
+
+@pytest.mark.parametrize(
+    ("code", "has_tie_points"),
+    [("other_surroundings", False), ("two_places", False), ("surer_apart", True)],
+)
+def test_tie_points_do_not_join_what_was_found_to_be_another_place(
+    adviser: Adviser, code: DoubtCode, *, has_tie_points: bool
+) -> None:
+    found = adviser.commands([LOST], taken_out={LOST: (Doubt(code),)})
+    assert any("--tie-points" in command for command in found) == has_tie_points
 
 
 def test_tie_points_that_begin_a_model_are_advised_where_there_is_none(
