@@ -33,8 +33,8 @@ from colmap_affrect.parallel.subprocesses import end_with
 
 # That a command has to end after Ctrl-C or SIGTERM, before it is killed; resource
 PATIENCE_S = 4.0
-# Until something says that packages are loaded, and on a terminal between two such lines: with the
-# start of Python less than 5; display
+# Until something says that packages are loaded, and between two such lines: with the start of
+# Python less than 5; display
 QUIET_S = 3.0
 TICK_S = 0.5  # between two looks at the clock; display
 LOADING = "loading: at work for {seconds:.0f} s"
@@ -140,14 +140,12 @@ def _speak_meanwhile(began_s: float, wait: Callable[[float], bool]) -> None:
     def speak() -> None:
         if hasattr(signal, "pthread_sigmask"):  # signals are for the main thread
             signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
-        is_watched = bool(sys.stderr) and sys.stderr.isatty()
         wanted_s = QUIET_S
         while not wait(TICK_S):
             passed_s = time.monotonic() - began_s
             if passed_s >= wanted_s:
                 say(LOADING.format(seconds=passed_s))
-                # In a log each line comes after twice the time
-                wanted_s = passed_s + QUIET_S if is_watched else 2 * passed_s
+                wanted_s = passed_s + QUIET_S
 
     threading.Thread(target=speak, daemon=True).start()
 

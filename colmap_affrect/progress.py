@@ -18,10 +18,8 @@ from colmap_affrect.forecast import Forecast
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10  # display
 # Of silence, until something says that the work goes on (display): with the start of Python and
-# the second between two looks less than 5; where lines stay, as in a log,
-# twice as long after each of them, up to the longest
+# the second between two looks less than 5
 QUIET_S = 4.0
-LONGEST_QUIET_S = 60.0  # Display
 USUAL_SIZE = (80, 24)  # columns and rows of a terminal; display
 
 
@@ -61,10 +59,8 @@ class Voice:
         if now_s - self._heard_s < self._quiet_s:
             return ""
         self._heard_s = now_s
-        self._quiet_s = 1.0  # a line that is replaced counts the seconds
-        if stays:
-            silent_s = now_s - self._since_s
-            self._quiet_s = min(max(QUIET_S, silent_s), LONGEST_QUIET_S)
+        # A line that is replaced counts the seconds
+        self._quiet_s = QUIET_S if stays else 1.0
         text = f"{self.doing}: at work for {now_s - self._since_s:.0f} s"
         left = self.forecast.text() if self.forecast else ""
         return f"{text}, {left}" if left else text
