@@ -29,6 +29,9 @@ logger = logging.getLogger(__name__)
 BYTES_PER_ROW = 4096  # format: a page of SQLite
 # What :func:`require_database_space` reckons with; measured
 BYTES_OF_EMPTY_DATABASE = 1 << 19
+# Free on the disk, below which a database that does not open is said to lack space: SQLite's files
+# beside it take some. Measured: half a MB may not suffice
+BYTES_TO_OPEN = 1 << 22
 # How often a database is tried that others are using; resource
 TRIES_TO_OPEN = 10
 PAUSE_S = 0.1  # resource: before it is tried again
@@ -45,7 +48,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
             f"not a usable COLMAP database ({error})", where=path
         ) from error
     except RuntimeError as error:
-        require_space(path, BYTES_OF_EMPTY_DATABASE)
+        require_space(path, BYTES_TO_OPEN)
         if path.exists() and not os.access(path, os.W_OK):
             raise DatabaseError(
                 "cannot be written (it is read-only)",
