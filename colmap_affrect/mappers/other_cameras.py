@@ -54,13 +54,16 @@ def probability_of(log_odds: float) -> float:
 
 
 def pose_turns_deg(
-    model: pycolmap.Reconstruction, changed: pycolmap.Reconstruction
+    model: pycolmap.Reconstruction,
+    changed: pycolmap.Reconstruction,
+    image_ids: Collection[int] | None = None,
 ) -> dict[str, float]:
     """Return by how much the poses of a model differ from those of a changed one.
 
     Args:
         model: The model.
-        changed: The same images, with other cameras.
+        changed: The same images, with other cameras, or by other points.
+        image_ids: Of the images that are looked at; by default all of both.
 
     Returns:
         By image name the median change of its poses beside the others, in degrees, in rotation or
@@ -74,7 +77,9 @@ def pose_turns_deg(
         new = relative_pose(after[first], after[second])
         return max(pose_errors(new, old))
 
-    return median_changes(model, before.keys() & after.keys(), change_deg)
+    if image_ids is None:
+        image_ids = before.keys() & after.keys()
+    return median_changes(model, image_ids, change_deg)
 
 
 def median_changes(

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import pose_errors, relative_pose
 from colmap_affrect.geometry.arrays import Bools, Floats, sampling_step
 from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.model_score import GRID, grid_cells
-from colmap_affrect.mappers.other_cameras import median_changes
+from colmap_affrect.mappers.other_cameras import pose_turns_deg
 from colmap_affrect.mappers.other_motions import MIN_CELLS
-from colmap_affrect.mappers.pair_graph import has_rigs, poses_of
+from colmap_affrect.mappers.pair_graph import has_rigs
 
 MAX_NUM_POINTS = 1500  # that are looked at; resource
 MIN_VIEWS = 3  # of a point that tells poses from errors of its keypoints; theory
@@ -171,26 +170,9 @@ def _is_nearer(
     second: pycolmap.Reconstruction,
 ) -> bool:
     """Tell whether the poses of a model are nearer to those of the first of two others."""
-    names = model.reg_image_ids()
-    to_first = _changes_deg(model, first, names)
-    to_second = _changes_deg(model, second, names)
+    to_first = pose_turns_deg(model, first)
+    to_second = pose_turns_deg(model, second)
     return sum(to_first.values()) < sum(to_second.values())
-
-
-def _changes_deg(
-    before: pycolmap.Reconstruction,
-    after: pycolmap.Reconstruction,
-    image_ids: Collection[int],
-) -> dict[str, float]:
-    """Return how far images are turned or moved to each other, the median, by name."""
-    old = poses_of(before)
-    new = poses_of(after)
-
-    def change_deg(first: int, second: int) -> float:
-        estimated = relative_pose(new[first], new[second])
-        return max(pose_errors(estimated, relative_pose(old[first], old[second])))
-
-    return median_changes(before, image_ids, change_deg)
 
 
 def _motion(
@@ -221,7 +203,7 @@ def _motion(
         return None
     if num_together <= MIN_TOGETHER * num_others:
         return None
-    changes_deg = _changes_deg(sides[False].model, sides[True].model, both_tell)
+    changes_deg = pose_turns_deg(sides[False].model, sides[True].model, both_tell)
     return SmallMotion(float(num_cells[0] / num_cells.sum()), changes_deg)
 
 

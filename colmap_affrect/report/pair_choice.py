@@ -70,7 +70,7 @@ def pairs_to_check(
     strongest = _strongest_pairs(num_inliers, set(model.registered_names))
     registered = [name for name in model.registered_names if name in strongest]
     disagreeing = [pair for pair, share in agreement.items() if share < MIN_AGREEMENT]
-    agreeing = [pair for pair, share in agreement.items() if share >= MIN_AGREEMENT]
+    agreeing = _agreeing(agreement)
     turns = zip_longest(
         _of_pairs(disagreeing, Reason.DISAGREES),
         _of_pairs(lone_ties(agreeing), Reason.BRIDGE_EDGE),
@@ -94,6 +94,11 @@ def pairs_to_check(
     return {pair: "; ".join(texts) for pair, texts in reasons.items()}
 
 
+def _agreeing(agreement: Mapping[Pair, float]) -> list[Pair]:
+    """Return the pairs of which most inliers agree with the model."""
+    return [pair for pair, share in agreement.items() if share >= MIN_AGREEMENT]
+
+
 def backed_pairs(agreement: Mapping[Pair, float]) -> set[Pair]:
     """Return the pairs that the rest of a model speaks for: nobody needs to reject them.
 
@@ -107,7 +112,7 @@ def backed_pairs(agreement: Mapping[Pair, float]) -> set[Pair]:
         Pairs of which most inliers agree, and without which the model would still be one; names
         in order.
     """
-    agreeing = [pair for pair, share in agreement.items() if share >= MIN_AGREEMENT]
+    agreeing = _agreeing(agreement)
     num_pairs = Counter(name for pair in agreeing for name in pair)
     of_others = set[Pair]()
     for first, second in agreeing:

@@ -41,9 +41,9 @@ def tried(
     monkeypatch.setattr(hypotheses, "with_free_principal_points", lambda *_: "free")
     monkeypatch.setattr(hypotheses, "gains_of_freedom", lambda *_: gains)
     monkeypatch.setattr(HypothesisTest, "_take_shifted_axes", lambda *_: is_better)
-    test = HypothesisTest.__new__(HypothesisTest)
-    test.task = SimpleNamespace(cameras={})  # type: ignore[assignment]
-    test.search = "shared"  # type: ignore[assignment]
+    test: Any = HypothesisTest.__new__(HypothesisTest)
+    test.task = SimpleNamespace(cameras={})
+    test.search = "shared"
     test.per_image = own
     test.best = [MappedModel(pycolmap.Reconstruction(), axis_turns_deg={"a.jpg": 3.0})]
     test._try_own_shifted_axes()
