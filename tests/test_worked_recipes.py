@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from small_scene import FOCAL_PX, IMAGE_SIZE, NAMES, write_photographs
 
-from colmap_affrect.images.reading import read_mask
+from colmap_affrect.images.masks import read_mask
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"

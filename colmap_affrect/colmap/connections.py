@@ -26,9 +26,9 @@ def connected_parts(
         partners.setdefault(second, {second}).add(first)
     if not partners:
         return []
-    most = max(partners.values(), key=len)
-    if len(most) == len(partners):
-        return [most]  # one image is tied to all others
+    first_part = _tied_to(next(iter(partners)), partners)
+    if len(first_part) == len(partners):
+        return [first_part]  # which is so most often
     import networkx  # which takes as long to load as numpy and OpenCV together
 
     graph: networkx.Graph[T] = networkx.Graph()
@@ -37,6 +37,17 @@ def connected_parts(
     return sorted(
         networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
     )
+
+
+def _tied_to(image: T, partners: Mapping[T, set[T]]) -> set[T]:
+    """Return the images that pairs connect with one, itself among them."""
+    found = {image}
+    new = [image]
+    while new:
+        added = partners[new.pop()] - found
+        found |= added
+        new.extend(added)
+    return found
 
 
 def lone_ties(pairs: Iterable[tuple[T, T]]) -> list[tuple[T, T]]:

@@ -10,8 +10,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask, in_mask
 from colmap_affrect.geometry.arrays import Bools, Indices
 from colmap_affrect.geometry.conventions import pixel_from_colmap
+from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs
-from colmap_affrect.images.reading import read_mask
 
 
 def read_painted_masks(folder: Path, names: Mapping[str, int]) -> dict[int, Mask]:

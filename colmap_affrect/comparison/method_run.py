@@ -34,7 +34,7 @@ from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.errors import AffrectError, ConflictError, Option, damage
 from colmap_affrect.escalation.map_and_rematch import map_and_rematch
-from colmap_affrect.images import reading
+from colmap_affrect.images.masks import encode_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database, read_summaries
@@ -123,7 +123,7 @@ def masks_for_colmap(photographs: Photographs, names: Sequence[str]) -> Iterator
             target.parent.mkdir(parents=True, exist_ok=True)
             mask_path = mask_paths[name]
             if name in alphas:
-                replace_bytes(target, reading.encode_mask(alphas[name]))
+                replace_bytes(target, encode_mask(alphas[name]))
             elif mask_path:
                 shutil.copy(mask_path, target)
         yield folder

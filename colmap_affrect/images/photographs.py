@@ -23,6 +23,7 @@ from colmap_affrect.errors import (
     such_as,
 )
 from colmap_affrect.images import reading
+from colmap_affrect.images.masks import alpha_mask, read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.image_failures import ImageFailure, unusable
@@ -113,7 +114,7 @@ class Photographs:
         masks = list[Mask]()
         paths = list[Path]()
         own = self.own_mask(name)
-        alpha = None if own else reading.alpha_mask(image_path)
+        alpha = None if own else alpha_mask(image_path)
         if own:
             paths.append(own)
         if alpha is not None:
@@ -136,7 +137,7 @@ class Photographs:
         found: dict[str, Mask] = {}
         for name in names:
             with suppress(ImageError):  # who reads the image will find out
-                mask = reading.alpha_mask(self.folder / name)
+                mask = alpha_mask(self.folder / name)
                 if mask is not None:
                     found[name] = mask
         return found
@@ -207,9 +208,9 @@ def _mask_of_size(path: Path, size: tuple[int, int] | None, image_path: Path) ->
     """
     found = reading.header_size(path)
     if size is None:
-        return reading.read_mask(path)
+        return read_mask(path)
     if found is None or found == size:
-        mask = reading.read_mask(path)
+        mask = read_mask(path)
         found = (mask.shape[1], mask.shape[0])
         if found == size:
             return mask

@@ -21,7 +21,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.PpmImagePlugin import PpmImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 
-from colmap_affrect.data import ColorImage, GrayImage, Mask
+from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images.few_reads import FewReads
@@ -253,7 +253,6 @@ LIMITS_OF_OPENCV = (
 )
 # OpenCV's function that compares a header with these
 OPENCV_CHECKS_SIZE = "validateInputImageSize"
-MODES_WITH_ALPHA = ("RGBA", "RGBa", "LA", "La", "PA")  # Pillow's
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
     ".ppm",
@@ -289,8 +288,12 @@ GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-# Fast, of JPEG
-EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
+# A part of the size, which is fast of JPEG: as large as it may be, largest divisor first
+PARTS_OF_COLOR = {
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+}
 
 
 def read_gray(path: Path) -> GrayImage:
@@ -298,13 +301,16 @@ def read_gray(path: Path) -> GrayImage:
     return in_eight_bits(decode(path))
 
 
-def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
+def read_color(
+    path: Path, max_size_px: int, *, stretch: bool = True, is_shown: bool = False
+) -> ColorImage:
     """Read an image in colour, without applying EXIF orientation.
 
     Args:
         path: the file.
         max_size_px: longest side that the image is shrunk to.
         stretch: whether low contrast fills the range (:func:`tones`).
+        is_shown: people look at it, and nothing is measured in it.
 
     Returns:
         (H, W, 3) uint8, RGB.
@@ -312,9 +318,13 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
     Raises:
         ImageError: it is no image.
     """
-    size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
-    is_far_larger = size is not None and max(size) >= 8 * max_size_px
-    flags = EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED
+    is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    size = header_size(path) if is_jpeg else None
+    flags = COLOR_AS_STORED
+    for divisor, part in PARTS_OF_COLOR.items():
+        if size and max(size) >= divisor * max_size_px and (is_shown or divisor == 8):
+            flags = part | cv2.IMREAD_IGNORE_ORIENTATION
+            break
     try:
         image = decode(path, flags)[:, :, ::-1]
     except ImageError:  # OpenCV makes no colour of one channel of floats
@@ -490,61 +500,3 @@ def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
         ),
         dtype=np.uint8,
     )
-
-
-def read_mask(path: Path) -> Mask:
-    """Read a mask, black pixels False (COLMAP's convention); ImageError when that fails."""
-    return np.asarray(decode(path) != 0)
-
-
-def alpha_mask(path: Path) -> Mask | None:
-    """Return where a photograph is not transparent, (H, W); None where it is nowhere, or all over.
-
-    Half transparent is transparent: edges are mixed with what was cut off. An alpha channel that is
-    0 all over is one that a program has left empty. ImageError when the file cannot be read.
-    """
-    if not read_header(path, _has_alpha):
-        return None
-    image = decode(path, cv2.IMREAD_UNCHANGED)
-    is_there = image.ndim == 3 and image.shape[2] == 4
-    alpha = image[:, :, 3] if is_there else read_header(path, _alpha_beside_gray)
-    if alpha is None:
-        return None
-    is_integer = np.issubdtype(alpha.dtype, np.integer)
-    half = np.iinfo(alpha.dtype).max / 2 if is_integer else 0.5
-    mask = np.asarray(alpha > half)
-    return mask if mask.any() and not mask.all() else None
-
-
-def _alpha_beside_gray(file: BinaryIO) -> NDArray[Any] | None:
-    """Read the alpha channel of a gray TIFF, which OpenCV drops; None of one that Pillow turns."""
-    image = open_image(file)
-    if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-        return None
-    return np.asarray(image.convert("RGBA").getchannel("A"))
-
-
-def _has_alpha(file: BinaryIO) -> bool:
-    image = open_image(file)
-    return image.mode in MODES_WITH_ALPHA or "transparency" in image.info
-
-
-def encode_mask(mask: Mask) -> bytes:
-    """Return an (H, W) mask as PNG, white where it is True."""
-    return cv2.imencode(".png", mask.astype(np.uint8) * np.uint8(255))[1].tobytes()
-
-
-def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
-    """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
-    resized = cv2.resize(
-        mask.astype(np.uint8),
-        dsize=size,
-        interpolation=cv2.INTER_NEAREST_EXACT,
-    )
-    return np.asarray(resized > 0)
-
-
-def grow_mask(mask: Mask, num_px: int) -> Mask:
-    """Add the pixels of an (H, W) mask's surroundings, so many in each direction."""
-    kernel = np.ones((2 * num_px + 1, 2 * num_px + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

@@ -66,14 +66,20 @@ def redundancy_of(
 
 def straighten(
     model: pycolmap.Reconstruction, priors: Mapping[int, CameraPrior]
-) -> None:
+) -> bool:
     """Take the distortion of unknown cameras away, in place.
 
     Args:
         model: Whose cameras change.
         priors: What is known of them, by camera id.
+
+    Returns:
+        Whether there was any.
     """
+    was_bent = False
     for camera in used_cameras(model).values():
         if not priors[camera.camera_id].has_prior_focal_length:
             for index in camera.extra_params_idxs():
+                was_bent |= bool(camera.params[index])
                 camera.params[index] = 0.0
+    return was_bent

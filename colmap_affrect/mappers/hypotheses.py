@@ -17,6 +17,7 @@ from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import share_moving_as_modelled
 from colmap_affrect.mappers.own_cameras import (
     MAX_OPEN_IMAGES,
+    OwnCameras,
     one_camera,
     own_cameras,
     with_per_image_cameras,
@@ -83,7 +84,7 @@ class HypothesisTest:
         # The model whose images shared cameras, and by what it scored lower
         self.replaced: tuple[pycolmap.Reconstruction, float] | None = None
         # The last model that was tried with own cameras, and what these make of it
-        self.tried: tuple[pycolmap.Reconstruction, OtherCameras] | None = None
+        self.tried: tuple[pycolmap.Reconstruction, OwnCameras] | None = None
         self._begin_with_cameras_of(task.previous_models)
         self.best = restarted(self.search, task.previous_models)
         self.score = self.search.best_score(self.best)
@@ -230,9 +231,10 @@ class HypothesisTest:
         free = with_free_principal_points(own, self.task.cameras)
         if free is None or model.num_reg_images() > MAX_OWN_AXES:
             return
-        apart = own.grower(own.graph).remake(model)
-        if not gains_of_freedom(apart, own, free).contradict_constant:
+        trial = self._trial_with_own_cameras(own, model)
+        if not gains_of_freedom(trial, own, free).contradict_constant:
             return
+        apart = own.grower(own.graph).remake(model)
         shared = self.search, self.best
         self.search = own
         first = replace(self.best[0], reconstruction=apart, axis_turns_deg={})
@@ -242,6 +244,14 @@ class HypothesisTest:
             self.per_image = None
         else:
             self.search, self.best = shared
+
+    def _trial_with_own_cameras(
+        self, own: Search, model: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        """Return a model with a camera for each image, made from some of the tracks at least."""
+        if self.tried and self.tried[0] is model:
+            return self.tried[1].trial
+        return own.comparing().grower(own.graph.thinned()).restart_from(model)
 
     def _take_shifted_axes(self, free: Search) -> bool:
         """Take the best model with free principal points where it scores higher; tell whether."""
@@ -270,8 +280,7 @@ class HypothesisTest:
         own = with_per_image_cameras(
             self.per_image, graph, self.search, first.reconstruction
         )
-        if own.other:
-            self.tried = first.reconstruction, own.other
+        self.tried = first.reconstruction, own
         model = own.whole
         if model is None:
             return
@@ -305,8 +314,8 @@ class HypothesisTest:
         """Return what own cameras make of a model that shares some; None if it is not tried."""
         if self.per_image is None:
             return None
-        if self.tried and self.tried[0] is model:
-            return self.tried[1]
+        if self.tried and self.tried[0] is model and self.tried[1].other:
+            return self.tried[1].other
         is_small = model.num_reg_images() <= MAX_OPEN_IMAGES
         if not is_small or has_rigs(model):
             return None

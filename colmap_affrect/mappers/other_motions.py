@@ -8,7 +8,7 @@ moves is the same surface again and again.
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,9 +99,17 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
     strongest = strongest_of_images(graph.pairs_inside(poses), NUM_PAIRS)
     pairs = strongest[:MAX_NUM_PAIRS]
     cameras = cameras_of(model)
-    found = list[_Motions]()
+    least = max(MIN_NUM_SHOWING, MIN_SHOWING * len(pairs))
+    contradicting = list[_Motions]()
     for pair in pairs:
-        motions = _motions_of_pair(pair, poses, cameras, graph)
+        at_most = _contradicting(pair, poses, cameras, graph)
+        if at_most:
+            contradicting.append(at_most)
+    if len(contradicting) < least:
+        return 1.0  # whatever moves in them
+    found = list[_Motions]()
+    for at_most in contradicting:
+        motions = _moving_as_one(at_most)
         if motions:
             found.append(motions)
     num_pairs = _num_pairs_of_features(found)
@@ -109,7 +117,7 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
     for motions in found:
         if motions.cells()[1] >= MIN_CELLS and motions.is_chained(num_pairs):
             showing.append(motions)
-    if len(showing) < max(MIN_NUM_SHOWING, MIN_SHOWING * len(pairs)):
+    if len(showing) < least:
         return 1.0
     num_cells = np.sum([motions.cells() for motions in showing], axis=0)
     return float(num_cells[0] / max(num_cells.sum(), 1.0))
@@ -124,13 +132,13 @@ def _num_pairs_of_features(found: Collection[_Motions]) -> Features:
     return num_pairs
 
 
-def _motions_of_pair(
+def _contradicting(
     pair: VerifiedPair,
     poses: PoseById,
     cameras: CameraById,
     graph: PairGraph,
 ) -> _Motions | None:
-    """Return what moves as poses say, and what as one in another way; None where that is little.
+    """Return what moves as poses say, and all that contradicts them; None where that is little.
 
     Args:
         pair: The pair.
@@ -151,8 +159,8 @@ def _motions_of_pair(
     agreement = compared_with_pose(pose, both, (points1, points2))
     agrees = agreement.agrees
     is_far = ~(agreement.errors_px <= FARTHER * agreement.tolerance_px)
-    options = VerificationOptions()
-    if is_far.sum() < options.min_num_inliers:
+    least = VerificationOptions().min_num_inliers
+    if is_far.sum() < least:
         return None
     far = matches[is_far]
     # No motion has more cells than all of the matches that contradict the model.
@@ -166,11 +174,16 @@ def _motions_of_pair(
         return None
     matched = keypoints1[far[:, 0]], keypoints2[far[:, 1]]
     num_consistent = num_consistent_keypoints(matched)
-    if num_consistent is not None and num_consistent < options.min_num_inliers:
+    if num_consistent is not None and num_consistent < least:
         return None  # the matches of a surface agree with those beside them
-    geometry = estimate_geometry(sides, far, options)
+    return at_most
+
+
+def _moving_as_one(at_most: _Motions) -> _Motions | None:
+    """Return what of the matches that contradict a model moves as one; None where nothing does."""
+    geometry = estimate_geometry(at_most.sides, at_most.other, VerificationOptions())
     other = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-    return _Motions(pair, sides, matches[agrees], other) if len(other) else None
+    return replace(at_most, other=other) if len(other) else None
 
 
 def _in_cells(side: Side, features: Indices) -> Array:

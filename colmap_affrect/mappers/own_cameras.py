@@ -22,9 +22,10 @@ class OwnCameras:
 
     whole: pycolmap.Reconstruction | None
     """The model with them; None where it scores no higher with some of the tracks."""
-    other: (
-        OtherCameras | None
-    )  # what stays open where they score no higher; None: not looked at
+    other: OtherCameras | None
+    """What stays open where they score no higher; None: not looked at."""
+    trial: pycolmap.Reconstruction
+    """The model with them and some of the tracks at least."""
 
 
 def own_cameras(
@@ -102,11 +103,12 @@ def with_per_image_cameras(
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if scorer.score(trial) <= shared_score + MIN_SCORE_GAIN:
             if not is_looked_at:
-                return OwnCameras(None, None)
+                return OwnCameras(None, None, trial)
             grower.adjust_fully(trial)
-            return OwnCameras(None, _compared(model, trial, shared, scorer))
+            other = _compared(model, trial, shared, scorer)
+            return OwnCameras(None, other, trial)
     whole = per_image.grower(graph).remake(model)
     if thin is not graph or not is_looked_at:
-        return OwnCameras(whole, None)
+        return OwnCameras(whole, None, whole)
     scorer = replace(per_image.scorer, graph=graph)
-    return OwnCameras(whole, _compared(model, whole, shared, scorer))
+    return OwnCameras(whole, _compared(model, whole, shared, scorer), whole)

@@ -120,11 +120,14 @@ def gains_of_freedom(
     if not num_observations or not freed:
         return FreedomGains(0.0, 0.0, 0, 0)
     whole_cost = min(_near_the_middle(free, freed).costs_of_starts(model))
-    crop_cost = min(free.costs_of_starts(model))
-    shift_cost = min(_only_up_and_down(free, freed).costs_of_starts(model))
+    by_crops = whole_cost - min(free.costs_of_starts(model))
+    by_shifts = by_crops  # crops are shifted by no less, so that this is its limit
+    if by_crops > len(freed):  # else neither says anything
+        shifts = _only_up_and_down(free, freed)
+        by_shifts = whole_cost - min(shifts.costs_of_starts(model))
     return FreedomGains(
-        by_shifts=whole_cost - shift_cost,
-        by_crops=whole_cost - crop_cost,
+        by_shifts=by_shifts,
+        by_crops=by_crops,
         num_freed=len(freed),
         num_observations=num_observations,
     )

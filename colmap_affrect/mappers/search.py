@@ -224,11 +224,11 @@ class Search:
             model: It stays as it is; some of its points are adjusted.
         """
         as_it_is = with_fewer_points(model)
-        straight = with_fewer_points(model)
-        straighten(straight, self.adjuster.priors)
+        straight = pycolmap.Reconstruction(as_it_is)
+        was_bent = straighten(straight, self.adjuster.priors)
         adjuster = self.comparing().adjuster
         cost = adjuster.adjust(as_it_is, FINAL)
-        straight_cost = adjuster.adjust(straight, FINAL)
+        straight_cost = adjuster.adjust(straight, FINAL) if was_bent else cost
         return cost, straight_cost
 
     def comparing(self) -> Self:

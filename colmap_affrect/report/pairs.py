@@ -158,7 +158,9 @@ def draw_pair(
             "give the name of a new file that ends in .png", where=Option("output-path")
         )
     text = f"{names[0]} and {names[1]}: {pair.text}"
-    photographs = [read_color(image_path / name, SHEET_SIDE_PX) for name in names]
+    photographs = [
+        read_color(image_path / name, SHEET_SIDE_PX, is_shown=True) for name in names
+    ]
     picture = draw_matches(pair, photographs)
     rows = [_legend(pair.kinds), row_of([Panel(picture, text)], 1)]
     with new_results(target, names=names, replaces=not picture_path) as (new,):
@@ -203,7 +205,9 @@ def draw_pairs_to_check(
         context.by_hand.rejected,
         context.guided.read(),
     )
-    photograph = cache(lambda name: read_color(image_path / name, SIDE_PX))
+    photograph = cache(
+        lambda name: read_color(image_path / name, SIDE_PX, is_shown=True)
+    )
     pictures = []
     for names, why in chosen.items():
         # Unreadable, or rejected by hand and never matched

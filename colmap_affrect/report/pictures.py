@@ -63,7 +63,7 @@ def thumbnails(
 
     def picture(name: str) -> Picture | None:
         try:
-            return Picture.from_image(read_color(folder / name, side_px))
+            return Picture.from_image(read_color(folder / name, side_px, is_shown=True))
         except ImageError:
             return None
 

@@ -36,6 +36,7 @@ from colmap_affrect.geometry.lines import Lines
 from colmap_affrect.images import reading
 from colmap_affrect.images.depth import DepthMaps
 from colmap_affrect.images.lines import lines_of
+from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.orientation import picture_down
 from colmap_affrect.images.photographs import Photographs
 from colmap_affrect.parallel.executor import available_cores, available_memory_bytes
@@ -223,7 +224,7 @@ class ImageExtractor:
             name=name or path.name,
             path=path,
             camera_matrix=resized_from_original(original_size, size) @ intrinsics,
-            mask=None if mask is None else reading.shrink_mask(mask, size),
+            mask=None if mask is None else shrink_mask(mask, size),
             color=color,
             stretched=black_and_white is not None,
         )

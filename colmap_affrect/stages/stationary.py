@@ -23,7 +23,7 @@ from colmap_affrect.geometry.stationary import (
     num_moving_together,
     stationary_log_ratios,
 )
-from colmap_affrect.images.reading import grow_mask
+from colmap_affrect.images.masks import grow_mask
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.match_state import Size

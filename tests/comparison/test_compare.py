@@ -24,8 +24,8 @@ from colmap_affrect.comparison.method_run import MethodRun, masks_for_colmap
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.tables import to_json, verdict
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
+from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions, Photographs
-from colmap_affrect.images.reading import read_mask
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import PairOptions
 from colmap_affrect.progress import SILENT

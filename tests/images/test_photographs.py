@@ -20,6 +20,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.images.masks import read_mask, shrink_mask
 from colmap_affrect.images.photographs import (
     MaskOptions,
     Photographs,
@@ -27,7 +28,7 @@ from colmap_affrect.images.photographs import (
     list_images,
     photograph_files,
 )
-from colmap_affrect.images.reading import read_mask, read_photograph, shrink_mask
+from colmap_affrect.images.reading import read_photograph
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.stage_warnings import StageWarning, texts_by_subject
 

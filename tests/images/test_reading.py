@@ -11,6 +11,7 @@ import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,6 +100,31 @@ def test_low_contrast_is_stretched_alike_in_gray_and_colour(tmp_path: Path) -> N
     assert not gray[:, -15:].any()
     np.testing.assert_array_equal(color, np.dstack([gray] * 3))
     np.testing.assert_array_equal(read_color(path, 200, stretch=False)[..., 0], ramp)
+
+
+@pytest.mark.parametrize(
+    ("side_px", "divisor", "of_shown"),
+    [(79, 1, 2), (81, 1, 1), (41, 1, 2), (39, 1, 4), (20, 8, 8), (21, 1, 4)],
+)
+def test_the_decoder_shrinks_what_is_far_larger_or_only_shown(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    side_px: int,
+    divisor: int,
+    of_shown: int,
+) -> None:
+    path = write_image(tmp_path / "a.jpg", np.zeros((100, 160, 3), np.uint8))
+    decoded = []
+    decode_file = reading.decode
+
+    def decode_and_note(path: Path, flags: int) -> Any:
+        decoded.append(decode_file(path, flags))
+        return decoded[-1]
+
+    monkeypatch.setattr(reading, "decode", decode_and_note)
+    for is_shown in (False, True):
+        assert read_color(path, side_px, is_shown=is_shown).shape[1] == side_px
+    assert [image.shape[1] for image in decoded] == [160 // divisor, 160 // of_shown]
 
 
 @pytest.mark.parametrize("value_range", [(40, 220), (100, 108)])

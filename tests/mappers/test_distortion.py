@@ -107,6 +107,25 @@ def test_a_model_leaves_a_distortion_that_its_points_contradict(
     assert model.cameras[1].params[3] == distortion
 
 
+@pytest.mark.parametrize(("distortion", "num_adjusted"), [(TRAP, 2), (0.0, 1)])
+def test_a_straight_lens_is_adjusted_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    distortion: float,
+    num_adjusted: int,
+) -> None:
+    path = tmp_path / "database.db"
+    model = synthesize(path, num_rigs=3, num_points3D=80, camera_params=PARAMS)
+    model.cameras[1].params = [*PARAMS[:3], distortion]
+    record = CameraRecord(("a",), "guess", PARAMS[0], size=(1024, 768))
+    search = search_of(path, record)
+    costs = iter([7.0, 5.0])
+    monkeypatch.setattr(Adjuster, "adjust", lambda *_: next(costs))
+    expected = (7.0, 5.0) if num_adjusted == 2 else (7.0, 7.0)
+    assert search.costs_of_starts(model) == expected
+    assert len(list(costs)) == 2 - num_adjusted
+
+
 def test_a_straight_lens_that_fewer_pairs_agree_with_is_not_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

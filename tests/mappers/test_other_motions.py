@@ -24,13 +24,13 @@ from wall_scene import (
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import Side
-from colmap_affrect.mappers import scored_models
+from colmap_affrect.mappers import other_motions, scored_models
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.mapping import map_database, read_models
 from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import (
+    _contradicting,
     _Motions,
-    _motions_of_pair,
     share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
@@ -231,12 +231,37 @@ def test_matches_contradict_a_model_that_are_half_as_far_again_as_those_that_agr
         raw_matches={},
     )
     poses = {1: (np.eye(3), np.zeros(3)), 2: (np.eye(3), np.array([0.5, 0.0, 0.0]))}
-    found = _motions_of_pair(
+    found = _contradicting(
         VerifiedPair((1, 2), rows, NOTHING), poses, {1: CAMERA, 2: CAMERA}, graph
     )
     assert (len(found.other) if found else 0) == num_far
     if found:
         assert found.own[:, 0].tolist() == list(range(60, 120))
+
+
+@pytest.mark.parametrize(("num_contradicting", "num_verified"), [(1, 0), (2, 2)])
+def test_nothing_is_verified_where_too_few_pairs_contradict_a_model(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    num_contradicting: int,
+    num_verified: int,
+) -> None:
+    verified = []
+
+    def contradicting(pair: VerifiedPair, *_: Any) -> _Motions | None:
+        if pair.ids not in [(1, 2), (1, 3)][:num_contradicting]:
+            return None
+        side = Side(CAMERA, np.zeros((0, 2), np.float32))
+        return _Motions(pair, (side, side), NO_MATCHES, NO_MATCHES)
+
+    def estimate(*_: Any) -> pycolmap.TwoViewGeometry:
+        verified.append(1)
+        return NOTHING
+
+    monkeypatch.setattr(other_motions, "_contradicting", contradicting)
+    monkeypatch.setattr(other_motions, "estimate_geometry", estimate)
+    assert share(tmp_path / "still.db", -np.inf) == 1.0
+    assert len(verified) == num_verified
 
 
 def test_a_cell_belongs_to_the_motion_with_more_matches_in_it() -> None:

@@ -275,8 +275,16 @@ def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
     assert gains.leave_constant_open == leave_open
 
 
+@pytest.mark.parametrize(
+    ("gain", "by_shifts"),
+    [
+        (30.0, 20.0),
+        (3.1, 20.0),
+        (2.9, 2.9),  # a nat for each camera: shifts are not tried
+    ],
+)
 def test_gains_are_those_of_crops_and_of_shifts_up_and_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, by_shifts: float
 ) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
@@ -292,10 +300,10 @@ def test_gains_are_those_of_crops_and_of_shifts_up_and_down(
         assert down_px == pytest.approx(0.15 * 1024)
         is_crop = across_px == pytest.approx(0.15 * 1024)
         assert is_crop or across_px == pytest.approx(0.02 * 1024)
-        return (970.0, 2000.0) if is_crop else (2000.0, 980.0)
+        return (1000.0 - gain, 2000.0) if is_crop else (2000.0, 980.0)
 
     monkeypatch.setattr(Search, "costs_of_starts", costs)
     gains = gains_of_freedom(truth, constant, free)
     num_observations = truth.compute_num_observations()
-    assert gains == FreedomGains(20.0, 30.0, 3, num_observations)
+    assert gains == FreedomGains(by_shifts, gain, 3, num_observations)
     assert gains_of_freedom(truth, free, free).num_freed == 0
