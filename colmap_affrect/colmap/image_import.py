@@ -69,6 +69,8 @@ def import_images(
             require_database_space(new, 2 * len(missing))
             with open_database(read) as found:  # which makes it
                 _read_images(read, image_path, missing)
+                # The one that was read has taken its room.
+                require_database_space(new, len(missing))
                 with open_database(new) as database:
                     known.update(_copy_images(initial, found, database))
         if not new.exists():

@@ -13,7 +13,7 @@ from strategies import Array
 from synthetic import blobs, texture, write_image
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap import image_import, pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
@@ -67,6 +67,20 @@ def some_frames(count: int) -> Array:
     return lafs_from_keypoints(
         points, rng.uniform(5, 80, count), rng.uniform(-3, 3, count)
     )
+
+
+def test_import_images_looks_for_room_for_each_of_its_two_databases(
+    tmp_path: Path, image_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP ends the process where the second one finds that the first has taken its room."""
+    has_been_read = []
+
+    def require_space(new: Path, _: int) -> None:
+        has_been_read.append((new.parent / "read.db").exists())
+
+    monkeypatch.setattr(image_import, "require_database_space", require_space)
+    import_images(tmp_path / "database.db", image_folder, NAMES, CameraOptions())
+    assert has_been_read == [False, True]
 
 
 def test_import_images_adds_what_is_new_and_names_what_colmap_cannot_read(
