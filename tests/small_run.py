@@ -17,6 +17,7 @@ from colmap_affrect.project.report import Bridge, ModelSummary
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import PairPicture
@@ -126,7 +127,7 @@ def make_run_page(folder: Path) -> Path:
     reader = PairReader(graph, Context(workspace))
     report = small_report(folder)
     photographs = photographs_of_report(
-        workspace, NAMES, report.models, report.cameras, {}
+        ModelReader(workspace.sparse), NAMES, report.models, report.cameras, {}
     )
     lines = LinesOfRun(reader, NAMES, pairs)
     content = RunContent(

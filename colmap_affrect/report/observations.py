@@ -1,12 +1,29 @@
-"""Where the photographs of a model see its points, as arrays."""
+"""Where the photographs of a model see its points, as arrays.
+
+They are read from COLMAP's file of the images, in the layout of its documentation: pycolmap hands
+them out one by one, a microsecond and more each.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.project.regular_files import read_regular
+
+# COLMAP's images.bin: the number of images, then of each what comes before its name, the name up to
+# a zero byte, the number of its keypoints, and these; format
+COUNT = np.dtype("<u8")
+BEFORE_NAME = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera_id", "<u4")])
+KEYPOINT = np.dtype([("place", "<f8", 2), ("point_id", "<u8")])
+NO_POINT = np.iinfo(np.uint64).max  # of a keypoint that sees none
+
+Keypoints = NDArray[np.void]  # (N,) of KEYPOINT
 
 
 @dataclass(frozen=True)
@@ -55,45 +72,106 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
 
 
-def observations_of(model: pycolmap.Reconstruction) -> Observations:
-    """Return all observations of a model, photograph by photograph."""
+class ModelReader:
+    """Reads the models of a run, each once."""
+
+    def __init__(self, sparse_path: Path) -> None:
+        """Take the folder of all models; they are read when they are asked for."""
+        self.sparse_path = sparse_path
+        self._models = dict[int, pycolmap.Reconstruction]()
+        self._observations = dict[int, Observations]()
+
+    def path(self, number: int) -> Path:
+        """Return the folder of a model."""
+        return self.sparse_path / str(number)
+
+    def model(self, number: int) -> pycolmap.Reconstruction:
+        """Return a model, which is not to be changed.
+
+        Args:
+            number: of the model, the largest has 0.
+
+        Raises:
+            AffrectError: it cannot be read.
+        """
+        if number not in self._models:
+            self._models[number] = read_given_model(self.path(number))
+        return self._models[number]
+
+    def observations(self, number: int) -> Observations:
+        """Return all observations of a model, photograph by photograph.
+
+        Args:
+            number: of the model.
+
+        Raises:
+            AffrectError: it cannot be read.
+        """
+        if number not in self._observations:
+            model = self.model(number)
+            keypoints = _read_keypoints(self.path(number) / "images.bin")
+            self._observations[number] = _observations_of(model, keypoints)
+        return self._observations[number]
+
+
+def _read_keypoints(path: Path) -> dict[int, Keypoints]:
+    """Return the keypoints of the registered images, by image id, with the points that they see."""
+    data = read_regular(path)
+    (num_images,) = np.frombuffer(data, COUNT, 1).tolist()
+    at = COUNT.itemsize
+    found = dict[int, Keypoints]()
+    for _ in range(num_images):
+        (image_id,) = np.frombuffer(data, BEFORE_NAME, 1, at)["id"].tolist()
+        at = data.index(b"\0", at + BEFORE_NAME.itemsize) + 1
+        (num_keypoints,) = np.frombuffer(data, COUNT, 1, at).tolist()
+        at += COUNT.itemsize
+        found[image_id] = np.frombuffer(data, KEYPOINT, num_keypoints, at)
+        at += num_keypoints * KEYPOINT.itemsize
+    return found
+
+
+def _observations_of(
+    model: pycolmap.Reconstruction, keypoints: dict[int, Keypoints]
+) -> Observations:
+    """Return all observations of a model, of the keypoints of its images by image id."""
+    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    points = np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3)
     images = registered_images(model)
-    rows = []
-    point_ids = []
-    places = []
-    errors = []
+    rows = [np.empty(0, dtype=np.int64)]
+    point_ids = [np.empty(0, dtype=np.int64)]
+    places = [np.empty((0, 2))]
+    errors = [np.empty(0)]
     for row, image in enumerate(images):
-        seen = image.get_observation_points2D()
-        ids = [point.point3D_id for point in seen]
-        marks = np.array([point.xy for point in seen]).reshape(-1, 2)
-        rows.append(np.full(len(ids), row, dtype=np.int64))
-        point_ids.append(np.array(ids, dtype=np.int64))
-        places.append(marks)
-        errors.append(_errors_px(model, image, ids, marks))
-    none = np.empty(0, dtype=np.int64)
+        marks = keypoints[image.image_id]
+        seen = marks[marks["point_id"] != NO_POINT]
+        ids_of_image = seen["point_id"].astype(np.int64)
+        of_image = points[np.searchsorted(ids, ids_of_image)]
+        rows.append(np.full(len(seen), row, dtype=np.int64))
+        point_ids.append(ids_of_image)
+        places.append(seen["place"])
+        errors.append(_errors_px(model, image, of_image, seen["place"]))
     return Observations(
         names=tuple(image.name for image in images),
-        rows=np.concatenate([none, *rows]),
-        point_ids=np.concatenate([none, *point_ids]),
-        places=np.concatenate([np.empty((0, 2)), *places]),
-        errors_px=np.concatenate([np.empty(0), *errors]),
+        rows=np.concatenate(rows),
+        point_ids=np.concatenate(point_ids),
+        places=np.concatenate(places),
+        errors_px=np.concatenate(errors),
     )
 
 
 def _errors_px(
     model: pycolmap.Reconstruction,
     image: pycolmap.Image,
-    point_ids: list[int],
+    points: Array,
     places: Array,
 ) -> Array:
-    """Return the (P,) distances of (P, 2) places from where an image sees its points.
+    """Return the (P,) distances of (P, 2) places from where an image sees its (P, 3) points.
 
     A point that is behind the camera has none, and does not count.
     """
-    if not point_ids:
+    if not len(points):
         return np.empty(0)
     camera = model.cameras[image.camera_id]
-    points = np.array([model.points3D[point_id].xyz for point_id in point_ids])
     seen = camera.img_from_cam(image.cam_from_world() * points)
     errors: Array = np.linalg.norm(np.asarray(seen, np.float64) - places, axis=1)
     return np.where(np.isfinite(errors), errors, 0.0)

@@ -10,10 +10,10 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import require_known
-from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.geometry.arrays import Array, Indices, rows_in
 from colmap_affrect.pairs.lists import Pair
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.pair_choice import backed_pairs
 from colmap_affrect.session.context import Context
 from colmap_affrect.session.view_graph import ViewGraph
@@ -50,23 +50,23 @@ class MatchedPair:
 class PairReader:
     """Reads pairs of a database, with what the stores and the model of a run know."""
 
-    def __init__(self, graph: ViewGraph, context: Context) -> None:
+    def __init__(
+        self, graph: ViewGraph, context: Context, models: ModelReader | None = None
+    ) -> None:
         """Read the model of a run, and how its pairs agree with it.
 
         Args:
             graph: of the database.
             context: of the run; its folder need not have anything.
+            models: reads the models of the run.
         """
         workspace = context.workspace
-        model_path = workspace.sparse / "0"
+        models = models or ModelReader(workspace.sparse)
         has_stores = "match" in workspace.started_stages and not workspace.is_changed
         self.graph = graph
         self.run = context if has_stores else None
-        self.model = (
-            read_given_model(model_path)
-            if model_path.exists()
-            else pycolmap.Reconstruction()
-        )
+        has_model = models.path(0).exists()
+        self.model = models.model(0) if has_model else pycolmap.Reconstruction()
         # Share of inliers, by verified pair
         self.agreement = agreements(self.graph, self.model)
         self._backed = backed_pairs(self.agreement)

@@ -8,13 +8,11 @@ from typing import Any, Literal
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.options import documented
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.report import SOURCES, SURE, ModelSummary
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.observations import observations_of, registered_images
+from colmap_affrect.report.observations import ModelReader, registered_images
 
 NUM_NEIGHBOURS = 5  # that are named of each photograph; the viewer shows all
 
@@ -67,7 +65,7 @@ def quality_of(name: str, model: ModelSummary) -> Quality:
 
 
 def photographs_of_report(
-    workspace: Workspace,
+    reader: ModelReader,
     names: Sequence[str],
     models: Sequence[ModelSummary],
     cameras: Sequence[Mapping[str, Any]],
@@ -76,7 +74,7 @@ def photographs_of_report(
     """Return what is known of each photograph.
 
     Args:
-        workspace: of the run, with the models.
+        reader: of the models of the run.
         names: of all photographs.
         models: summaries of the models, the largest first.
         cameras: entries of ``report.json``, which say where focal lengths are from.
@@ -88,7 +86,7 @@ def photographs_of_report(
     begun = _of_cameras(cameras)
     placed = dict[str, dict[str, Any]]()
     for number, model in enumerate(models):
-        figures = _of_model(workspace, number)
+        figures = _of_model(reader, number)
         for name in model.registered_names:
             if name not in placed:
                 placed[name] = {
@@ -120,13 +118,13 @@ def _of_cameras(cameras: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any
     return found
 
 
-def _of_model(workspace: Workspace, number: int) -> dict[str, dict[str, Any]]:
+def _of_model(reader: ModelReader, number: int) -> dict[str, dict[str, Any]]:
     """Return the figures of the photographs of a model; none where it cannot be read."""
     try:
-        model = read_given_model(workspace.sparse / str(number))
+        model = reader.model(number)
+        seen = reader.observations(number)
     except AffrectError:
         return {}
-    seen = observations_of(model)
     counts = np.bincount(seen.rows, minlength=len(seen.names))
     errors_px = seen.mean_errors_px()
     found = {}

@@ -25,6 +25,7 @@ from colmap_affrect.project.report import (
     probability_text,
 )
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.page import TEMPLATES, Page, write_page
 from colmap_affrect.report.pair_lines import PairFile, PairLines
 from colmap_affrect.report.pairs import LEGEND, PairPicture
@@ -36,7 +37,12 @@ from colmap_affrect.report.photographs import (
 )
 from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.run_report import RunReport, contradiction_words
-from colmap_affrect.report.scene import View3D, max_num_observations, read_view
+from colmap_affrect.report.scene import (
+    View3D,
+    max_num_observations,
+    read_view,
+    read_view_with_tracks,
+)
 from colmap_affrect.report.verdict import QUALITIES, SIGNS, tool_of, verdict_of
 from colmap_affrect.report.why_not_sure import groups_of
 
@@ -77,6 +83,7 @@ class RunContent:
     cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     marks_command: str = ""  # maps again with marks that are saved
     masks_command: str = ""  # runs anew with masks that are saved
+    reader: ModelReader | None = None  # of the models; one of its own where None
 
 
 def write_run_page(
@@ -107,7 +114,7 @@ def write_run_page(
         if known.issuperset(pair)
     }
     photographs = _known_photographs(report, names)
-    views = _views(workspace, report)
+    views = _views(content.reader or ModelReader(workspace.sparse), report)
     can_mark = len(content.cameras.keys() & known) > 1
     page = Page(
         template=TEMPLATES / "run.html",
@@ -234,15 +241,14 @@ def _content(
     }
 
 
-def _views(workspace: Workspace, report: RunReport) -> list[View3D]:
+def _views(reader: ModelReader, report: RunReport) -> list[View3D]:
     """Read the largest models, with the classes of their photographs as colours."""
     views = []
     shown = report.models[:MAX_NUM_MODELS]
     most = max_num_observations(report.images_total) // max(1, len(shown))
     for number, model in enumerate(shown):
         kinds = {name: quality_of(name, model) for name in model.registered_names}
-        path = workspace.sparse / str(number)
-        views.append(read_view(path, kinds, most))
+        views.append(read_view_with_tracks(reader, number, kinds, most))
     return views
 
 

@@ -18,6 +18,7 @@ from colmap_affrect.report.advice import (
     command_with_masks,
     command_with_tie_points,
 )
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import draw_pairs_to_check
@@ -61,6 +62,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     verified = context.num_verified_inliers().items()
     by_hand = context.by_hand
     pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
+    models = ModelReader(workspace.sparse)
     missing = unregistered(context, result.names, result.models, pair_inliers)
     cameras = cameras_of_report(workspace, result.models, result.extended)
     line_findings = _line_findings(context, result.names)
@@ -82,7 +84,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
         cameras=cameras,
         lines=lines,
         photographs=photographs_of_report(
-            workspace, result.names, result.models, cameras, lines
+            models, result.names, result.models, cameras, lines
         ),
         focal_contradictions=focal_contradictions,
         extended=tuple(result.extended),
@@ -104,7 +106,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     workspace.remove_page()  # a kill leaves none beside another report
     replace_text(workspace.report, report.to_json())
     if page:
-        _write_page(context, result, report, num_inliers=pair_inliers)
+        _write_page(context, result, report, models, num_inliers=pair_inliers)
     if not workspace.is_foreign:
         context.features.keep_summaries()
     return report
@@ -122,6 +124,7 @@ def _write_page(
     context: Context,
     result: MappingResult,
     report: RunReport,
+    models: ModelReader,
     num_inliers: Mapping[Pair, int],
 ) -> None:
     """Write ``report.html``.
@@ -130,10 +133,11 @@ def _write_page(
         context: of the workspace, with its models.
         result: of mapping.
         report: of the run.
+        models: reads its models.
         num_inliers: of the verified pairs.
     """
     workspace = context.workspace
-    reader = PairReader(context.graph, context)
+    reader = PairReader(context.graph, context, models)
     lines = LinesOfRun(reader, result.names, num_inliers)
     content = RunContent(
         names=result.names,
@@ -147,6 +151,7 @@ def _write_page(
         cameras=context.graph.cameras,
         marks_command=command_with_tie_points(context),
         masks_command=command_with_masks(context),
+        reader=models,
     )
     write_run_page(workspace, report, content, context.progress)
 

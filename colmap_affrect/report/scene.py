@@ -12,7 +12,11 @@ from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import AffrectError, with_flags
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 from colmap_affrect.geometry.upright import upright_rotation
-from colmap_affrect.report.observations import observations_of, registered_images
+from colmap_affrect.report.observations import (
+    ModelReader,
+    Observations,
+    registered_images,
+)
 from colmap_affrect.report.pictures import base64_text
 from colmap_affrect.report.upright import upright_of_run
 
@@ -92,16 +96,12 @@ def max_num_observations(num_photographs: int) -> int:
     return round(OBSERVATIONS_PER_POINT * max_num_points(num_photographs))
 
 
-def read_view(
-    path: Path | None, kinds: Mapping[str, str], max_num_observations: int = 0
-) -> View3D:
+def read_view(path: Path | None, kinds: Mapping[str, str]) -> View3D:
     """Read a model and turn it upright; a note says why there is none, or it cannot be read.
 
     Args:
         path: folder of the model.
         kinds: names of the colours of the cameras, by photograph.
-        max_num_observations: of points in photographs, for a page that looks through these; 0: it
-            does not.
 
     Returns:
         The view.
@@ -111,10 +111,44 @@ def read_view(
     try:
         model = read_given_model(path)
     except AffrectError as error:
-        return View3D(note=f"The model cannot be shown: {with_flags(error.words)}")
+        return _no_view(error)
+    _turn_upright(model, path)
+    return replace(view_of(model), kinds=kinds)
+
+
+def read_view_with_tracks(
+    reader: ModelReader,
+    number: int,
+    kinds: Mapping[str, str],
+    max_num_observations: int,
+) -> View3D:
+    """Return a view for a page that looks through its photographs, see :func:`read_view`.
+
+    Args:
+        reader: of the models of a run.
+        number: of the model.
+        kinds: names of the colours of the cameras, by photograph.
+        max_num_observations: of points in photographs.
+
+    Returns:
+        The view.
+    """
+    try:
+        seen = reader.observations(number)
+    except AffrectError as error:
+        return _no_view(error)
+    model = pycolmap.Reconstruction(reader.model(number))
+    _turn_upright(model, reader.path(number))
+    return replace(view_of(model, seen, max_num_observations), kinds=kinds)
+
+
+def _no_view(error: AffrectError) -> View3D:
+    return View3D(note=f"The model cannot be shown: {with_flags(error.words)}")
+
+
+def _turn_upright(model: pycolmap.Reconstruction, path: Path) -> None:
     upright = upright_of_run(path, model)
     fit_upright(model, None if upright is None else upright.direction)
-    return replace(view_of(model, max_num_observations), kinds=kinds)
 
 
 def fit_upright(model: pycolmap.Reconstruction, up: Floats | None = None) -> None:
@@ -160,12 +194,17 @@ def _poses(model: pycolmap.Reconstruction) -> tuple[Array, Array]:
     return axes.reshape(-1, 3, 3), centers.reshape(-1, 3)
 
 
-def view_of(model: pycolmap.Reconstruction, max_num_observations: int = 0) -> View3D:
+def view_of(
+    model: pycolmap.Reconstruction,
+    seen: Observations | None = None,
+    max_num_observations: int = 0,
+) -> View3D:
     """Return a model that was turned upright as the page has it.
 
     Args:
         model: inside of a sphere of radius 1 about 0, see :func:`fit_upright`.
-        max_num_observations: see :func:`read_view`.
+        seen: where its photographs see its points, for a page that looks through these.
+        max_num_observations: of these that the page has.
     """
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     most = max_num_points(model.num_reg_images())
@@ -187,18 +226,20 @@ def view_of(model: pycolmap.Reconstruction, max_num_observations: int = 0) -> Vi
         base64_text(quantised.tobytes() + visible.tobytes()),
         _pyramids(model),
     )
-    if not max_num_observations:
+    if seen is None:
         return view
-    tracks = _tracks(model, ids, max_num_observations)
+    tracks = _tracks(model, seen, ids, max_num_observations)
     return replace(view, tracks=tracks, looks=_looks(model))
 
 
 def _tracks(
-    model: pycolmap.Reconstruction, ids: Indices, max_num_observations: int
+    model: pycolmap.Reconstruction,
+    seen: Observations,
+    ids: Indices,
+    max_num_observations: int,
 ) -> str:
     """Return where photographs see the (N,) points, as ``View3D.tracks``."""
     images = registered_images(model)
-    seen = observations_of(model)
     order = np.argsort(ids)
     position = np.searchsorted(ids, seen.point_ids, sorter=order)
     numbers = (

@@ -27,6 +27,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import MatchedPair, MatchKind
 from colmap_affrect.report.photographs import photographs_of_report
@@ -126,7 +127,9 @@ def make_page(num_images: int, folder: Path) -> Path:
         preset="sparse",
         verification={},
         mapping={"name": "sparse", "mapper_options": {}},
-        photographs=photographs_of_report(workspace, names, (summary,), (), {}),
+        photographs=photographs_of_report(
+            ModelReader(workspace.sparse), names, (summary,), (), {}
+        ),
     )
     lines = LinesOfRun(MadeUpPairs(), names, num_inliers)
     cameras = {}

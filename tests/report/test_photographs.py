@@ -14,14 +14,14 @@ from small_run import MORE, NAMES, make_run_page, small_report
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.observations import observations_of
+from colmap_affrect.report.observations import ModelReader, registered_images
 from colmap_affrect.report.photographs import (
     PhotographReport,
     corner_distortion_px,
     photographs_of_report,
     quality_of,
 )
-from colmap_affrect.report.scene import View3D, radial_distortion, read_view
+from colmap_affrect.report.scene import View3D, radial_distortion, read_view_with_tracks
 from colmap_affrect.report.verdict import verdict_of
 
 
@@ -41,7 +41,9 @@ def model(workspace: Workspace) -> pycolmap.Reconstruction:
 def photographs(workspace: Workspace) -> dict[str, PhotographReport]:
     report = small_report(workspace.path)
     return dict(
-        photographs_of_report(workspace, NAMES, report.models, report.cameras, {})
+        photographs_of_report(
+            ModelReader(workspace.sparse), NAMES, report.models, report.cameras, {}
+        )
     )
 
 
@@ -117,6 +119,12 @@ def test_radial_distortion_of_cameras_is_found(name: str, extra: list[float]) ->
     assert radial_distortion(camera) == pytest.approx(expected, abs=1e-4)
 
 
+def view_of_run(workspace: Workspace, max_num_observations: int) -> View3D:
+    """The view of its largest model, with who sees its points."""
+    reader = ModelReader(workspace.sparse)
+    return read_view_with_tracks(reader, 0, {}, max_num_observations)
+
+
 def decoded(view: View3D) -> list[tuple[np.ndarray, list[tuple[int, np.ndarray]]]]:
     """Return the points of a view, with (row of the camera, px) of who sees each."""
     data = base64.b64decode(view.points)
@@ -144,10 +152,10 @@ def test_the_page_projects_points_to_where_photographs_see_them(
     workspace: Workspace, model: pycolmap.Reconstruction
 ) -> None:
     """By what its script has: pose, focal length, axis, radial distortion."""
-    view = read_view(workspace.sparse / "0", {}, 10_000)
+    view = view_of_run(workspace, 10_000)
     points = decoded(view)
     num_seers = sum(len(seers) for _, seers in points)
-    assert num_seers == len(observations_of(model).rows)
+    assert num_seers == sum(len(points_of(image)) for image in model.images.values())
     errors = []
     for place, seers in points:
         for row, seen in seers:
@@ -163,8 +171,8 @@ def test_the_page_projects_points_to_where_photographs_see_them(
 
 
 def test_a_page_has_at_most_so_many_observations(workspace: Workspace) -> None:
-    whole = decoded(read_view(workspace.sparse / "0", {}, 10_000))
-    some = decoded(read_view(workspace.sparse / "0", {}, 100))
+    whole = decoded(view_of_run(workspace, 10_000))
+    some = decoded(view_of_run(workspace, 100))
     counts = [len(seers) for _, seers in some]
     assert 90 <= sum(counts) <= 100
     for (_, few), (_, all_of_them) in zip(some, whole, strict=True):
@@ -172,10 +180,28 @@ def test_a_page_has_at_most_so_many_observations(workspace: Workspace) -> None:
             assert [row for row, _ in few] == [row for row, _ in all_of_them]
 
 
-def test_shared_points_are_counted_for_each_pair(
-    model: pycolmap.Reconstruction,
+def test_observations_are_those_of_pycolmap(
+    workspace: Workspace, model: pycolmap.Reconstruction
 ) -> None:
-    seen = observations_of(model)
+    """Its own come one by one."""
+    seen = ModelReader(workspace.sparse).observations(0)
+    for row, image in enumerate(registered_images(model)):
+        marks = image.get_observation_points2D()
+        is_own = seen.rows == row
+        ids = [mark.point3D_id for mark in marks]
+        assert seen.names[row] == image.name
+        assert seen.point_ids[is_own].tolist() == ids
+        np.testing.assert_array_equal(seen.places[is_own], [mark.xy for mark in marks])
+        errors_px = []
+        for mark in marks:
+            projected = image.project_point(model.points3D[mark.point3D_id].xyz)
+            errors_px.append(np.linalg.norm(projected - mark.xy))
+        assert len(errors_px) > 10
+        np.testing.assert_allclose(seen.errors_px[is_own], errors_px, atol=1e-9)
+
+
+def test_shared_points_are_counted_for_each_pair(workspace: Workspace) -> None:
+    seen = ModelReader(workspace.sparse).observations(0)
     by_row = [set(seen.point_ids[seen.rows == row]) for row in range(len(seen.names))]
     for one, two in itertools.combinations(range(len(by_row)), 2):
         assert seen.num_shared[one, two] == len(by_row[one] & by_row[two])

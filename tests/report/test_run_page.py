@@ -184,7 +184,8 @@ def test_thumbnails_are_smaller_the_more_photographs_a_page_has(
     """All together have at most 6 megapixels, or 126 px in length each."""
     asked = []
 
-    def read(_: Path, size_px: int) -> np.ndarray:
+    def read(_: Path, size_px: int, *, is_shown: bool) -> np.ndarray:
+        assert is_shown
         asked.append(size_px)
         return np.zeros((2, 2, 3), np.uint8)
 

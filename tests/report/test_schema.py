@@ -16,6 +16,7 @@ from colmap_affrect.mappers.camera_priors import FocalContradiction
 from colmap_affrect.project.line_report import LineReport
 from colmap_affrect.project.report import MatchedAgain, Residual
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.run_report import RunReport
 from colmap_affrect.report.schema import ReportFile, report_schema
@@ -31,7 +32,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> RunReport:
     make_run_page(folder)
     small = small_report(folder)
     workspace = Workspace(folder / "out")
-    found = photographs_of_report(workspace, NAMES, small.models, small.cameras, {})
+    found = photographs_of_report(
+        ModelReader(workspace.sparse), NAMES, small.models, small.cameras, {}
+    )
     (model,) = small.models
     (camera,) = small.cameras
     mapped = replace(model, tie_points=(Residual("1", NAMES[0], 2.5),))

@@ -21,6 +21,7 @@ from small_scene import NAMES as SCENE_NAMES
 from colmap_affrect.project.reasons import Missing
 from colmap_affrect.project.report import ModelSummary, Residual
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.photographs import photographs_of_report
 from colmap_affrect.report.run_page import RunContent, write_run_page
 from colmap_affrect.session.view_graph import ViewGraph
@@ -111,7 +112,9 @@ def page(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
         **vars(report),
         "models": (model,),
         "unregistered": dict.fromkeys(names[4:], Missing("not_registered")),
-        "photographs": photographs_of_report(workspace, names, (model,), (), {}),
+        "photographs": photographs_of_report(
+            ModelReader(workspace.sparse), names, (model,), (), {}
+        ),
     }
     cameras = ViewGraph(workspace.database).cameras
     content = RunContent(names, {}, tmp_path / "photographs", marks, cameras=cameras)
