@@ -7,12 +7,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.geometry.arrays import Bools, Indices
 
 T = TypeVar("T", int, str)
-
-# Of a number that tells features of several images apart, for the feature; format
-FEATURE_BITS = 32
 
 
 def connected_parts(
@@ -92,23 +89,34 @@ def _is_tied_otherwise(first: T, second: T, partners: Mapping[T, set[T]]) -> boo
 def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
     """Return how many features of each image, of (M, 2) by pair, are in tracks of three or more."""
     images = sorted(set(chain.from_iterable(matches)))
-    numbers = {image: number for number, image in enumerate(images)}
-    ends = [np.zeros(0, np.int64)]  # features of first images, then of second ones
-    for side in (0, 1):
-        for pair, indices in matches.items():
-            image_bits = numbers[pair[side]] << FEATURE_BITS
-            ends.append(image_bits + indices[:, side])
-    features, rows, num_matches = np.unique(
-        np.concatenate(ends), return_inverse=True, return_counts=True
-    )
-    first, second = rows.reshape(2, -1)
+    num_features = dict.fromkeys(images, 0)  # as far as they have matches
+    for pair, indices in matches.items():
+        for image, features in zip(pair, indices.T, strict=True):
+            most = int(features.max(initial=-1)) + 1
+            num_features[image] = max(num_features[image], most)
+    # Features of all images are numbered one after the other.
+    starts = _sums_before(np.array(list(num_features.values()), np.int64))
+    start_of = dict(zip(images, starts.tolist(), strict=False))
+    ends = [np.zeros((0, 2), np.int64)]
+    for pair, indices in matches.items():
+        ends.append(indices + np.array([start_of[image] for image in pair]))
+    first, second = np.concatenate(ends).T
+    num_all = int(starts[-1])
+    num_matches = np.bincount(first, minlength=num_all)
+    num_matches += np.bincount(second, minlength=num_all)
     has_two_matches = num_matches > 1
     in_track = has_two_matches.copy()
     in_track[first[has_two_matches[second]]] = True
     in_track[second[has_two_matches[first]]] = True
-    images_in_tracks = features[in_track] >> FEATURE_BITS
-    counts = np.bincount(images_in_tracks, minlength=len(images)).tolist()
+    counts = np.diff(_sums_before(in_track)[starts]).tolist()
     return dict(zip(images, counts, strict=True))
+
+
+def _sums_before(values: Indices | Bools) -> Indices:
+    """Return the (N + 1,) sums of all values before each of N, and of all."""
+    sums = np.zeros(len(values) + 1, np.int64)
+    np.cumsum(values, out=sums[1:])
+    return sums
 
 
 def weakly_connected_images(

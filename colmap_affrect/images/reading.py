@@ -318,19 +318,25 @@ def read_color(
     Raises:
         ImageError: it is no image.
     """
-    is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")
-    size = header_size(path) if is_jpeg else None
-    flags = COLOR_AS_STORED
-    for divisor, part in PARTS_OF_COLOR.items():
-        if size and max(size) >= divisor * max_size_px and (is_shown or divisor == 8):
-            flags = part | cv2.IMREAD_IGNORE_ORIENTATION
-            break
     try:
+        flags = _color_flags(path, max_size_px, is_shown=is_shown)
         image = decode(path, flags)[:, :, ::-1]
     except ImageError:  # OpenCV makes no colour of one channel of floats
         image = np.repeat(decode(path)[:, :, None], 3, axis=2)
     black_and_white = tones(image) if stretch else None
     return shrink_to(in_eight_bits(image, black_and_white), max_size_px)
+
+
+def _color_flags(path: Path, max_size_px: int, *, is_shown: bool) -> int:
+    """Return OpenCV's flags, see :func:`read_color`: what is far larger is read as a part."""
+    is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    size = header_size(path) if is_jpeg else None
+    if size:
+        for divisor, part in PARTS_OF_COLOR.items():
+            is_enough = max(size) >= divisor * max_size_px
+            if is_enough and (is_shown or divisor == max(PARTS_OF_COLOR)):
+                return part | cv2.IMREAD_IGNORE_ORIENTATION
+    return COLOR_AS_STORED
 
 
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:

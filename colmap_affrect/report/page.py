@@ -40,6 +40,7 @@ class Page:
     script_data: Mapping[str, Any] = field(default_factory=dict)
     scripts: Sequence[str] = ("page.js", "geometry.js", "viewer.js")
     reads_files: bool = False  # scripts beside it, at a click
+    made_from: str = ""  # what :mod:`colmap_affrect.report.page_key` finds again
 
 
 def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
@@ -92,6 +93,7 @@ def write_page(path: Path, page: Page, progress: Progress = SILENT) -> Path:
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
         "scripts": digests,
         "reads_files": page.reads_files,
+        "made_from": page.made_from,
         "script_data": _script_data(page),
         "thumbnails": (
             thumbnails(page.image_path, page.names, progress) if page.image_path else {}

@@ -84,6 +84,7 @@ class RunContent:
     marks_command: str = ""  # maps again with marks that are saved
     masks_command: str = ""  # runs anew with masks that are saved
     reader: ModelReader | None = None  # of the models; one of its own where None
+    key: str = ""  # of all that it is made from; empty where nothing tells
 
 
 def write_run_page(
@@ -139,6 +140,7 @@ def write_run_page(
         },
         scripts=SCRIPTS + TOOL_SCRIPTS if can_mark else SCRIPTS,
         reads_files=bool(content.pair_files),
+        made_from=f"{content.key} {len(content.pair_files)}" if content.key else "",
     )
     return write_page(workspace.page, page, progress)
 

@@ -1,7 +1,7 @@
 """What a run ends with: ``report.json`` and ``report.html``, from the models that mapping made."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from colmap_affrect.colmap.by_hand import Marks
@@ -19,6 +19,7 @@ from colmap_affrect.report.advice import (
     command_with_tie_points,
 )
 from colmap_affrect.report.observations import ModelReader
+from colmap_affrect.report.page_key import is_current, page_key
 from colmap_affrect.report.pair_lines import LinesOfRun
 from colmap_affrect.report.pair_matches import PairReader
 from colmap_affrect.report.pairs import draw_pairs_to_check
@@ -53,7 +54,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     Args:
         context: of the workspace, with its models.
         result: of mapping.
-        page: also write ``report.html``.
+        page: also write ``report.html``; one that was made from the same stays.
 
     Returns:
         The report that is also written to ``report.json``.
@@ -63,19 +64,50 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     by_hand = context.by_hand
     pair_inliers = {pair: num for pair, num in verified if by_hand.allows(*pair)}
     models = ModelReader(workspace.sparse)
-    missing = unregistered(context, result.names, result.models, pair_inliers)
+    report = _report(context, result, models, num_inliers=pair_inliers)
+    commands = command_with_tie_points(context), command_with_masks(context)
+    key = page_key(workspace, report, result.marks, commands)
+    keeps_page = page and is_current(workspace, key)
+    if not keeps_page:
+        workspace.remove_page()  # a kill leaves none beside another report
+    replace_text(workspace.report, report.to_json())
+    if page and not keeps_page:
+        content = _page_content(context, result, report, models, pair_inliers)
+        content = replace(content, key=key)
+        write_run_page(workspace, report, content, context.progress)
+    if not workspace.is_foreign:
+        context.features.keep_summaries()
+    return report
+
+
+def _report(
+    context: Context,
+    result: MappingResult,
+    models: ModelReader,
+    num_inliers: Mapping[Pair, int],
+) -> RunReport:
+    """Return the report of a run.
+
+    Args:
+        context: of the workspace, with its models.
+        result: of mapping.
+        models: reads the models.
+        num_inliers: of the verified pairs.
+    """
+    workspace = context.workspace
+    missing = unregistered(context, result.names, result.models, num_inliers)
     cameras = cameras_of_report(workspace, result.models, result.extended)
     line_findings = _line_findings(context, result.names)
     lines = lines_of_report(context.features, line_findings)
     escalated = escalation_summary(context)
     escalates = escalated.matched_again or escalated.untried
     focal_contradictions = contradictions_of_report(context, line_findings)
-    report = RunReport(
+    return RunReport(
         output_path=workspace.path,
         images_total=len(result.names),
         unregistered=missing,
         models=tuple(result.models),
-        num_verified_pairs=len(pair_inliers),
+        num_verified_pairs=len(num_inliers),
         stages=sum_by_stage(result.stages),
         versions=installed_versions(),
         preset=result.options.preset_name,
@@ -92,24 +124,17 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
             context,
             missing,
             result.models,
-            max(pair_inliers.values(), default=0),
+            max(num_inliers.values(), default=0),
             escalated.untried,
             escalated.effort,
             focal_contradictions,
         ),
-        by_hand=by_hand.texts(),
+        by_hand=context.by_hand.texts(),
         effort=escalated.effort if escalates else "",
         matched_again=escalated.matched_again,
         untried=escalated.untried,
         **_own_results(context),
     )
-    workspace.remove_page()  # a kill leaves none beside another report
-    replace_text(workspace.report, report.to_json())
-    if page:
-        _write_page(context, result, report, models, num_inliers=pair_inliers)
-    if not workspace.is_foreign:
-        context.features.keep_summaries()
-    return report
 
 
 def _line_findings(context: Context, names: Sequence[str]) -> dict[str, LineFindings]:
@@ -120,14 +145,14 @@ def _line_findings(context: Context, names: Sequence[str]) -> dict[str, LineFind
     return {name: known[name] for name in names if name in known}
 
 
-def _write_page(
+def _page_content(
     context: Context,
     result: MappingResult,
     report: RunReport,
     models: ModelReader,
     num_inliers: Mapping[Pair, int],
-) -> None:
-    """Write ``report.html``.
+) -> RunContent:
+    """Return what ``report.html`` has beside the report.
 
     Args:
         context: of the workspace, with its models.
@@ -139,7 +164,7 @@ def _write_page(
     workspace = context.workspace
     reader = PairReader(context.graph, context, models)
     lines = LinesOfRun(reader, result.names, num_inliers)
-    content = RunContent(
+    return RunContent(
         names=result.names,
         num_inliers=num_inliers,
         image_path=workspace.photographs(),
@@ -153,7 +178,6 @@ def _write_page(
         masks_command=command_with_masks(context),
         reader=models,
     )
-    write_run_page(workspace, report, content, context.progress)
 
 
 def _own_results(context: Context) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from colmap_affrect.interop.export import export
 from colmap_affrect.project.feature_store import FeatureStore
 from colmap_affrect.project.record import ModelInputs
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import upright
 from colmap_affrect.report.scene import read_view
 
 UP = (
@@ -135,6 +136,17 @@ def test_photographs_that_are_stored_on_their_side_have_their_own_upright(
     old = before.images[1].cam_from_world().rotation.matrix()
     new = after.images[1].cam_from_world().rotation.matrix()
     assert_allclose(new.T @ old @ up_in_model, [0.0, 0.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("most", "num_asked"), [(4, 4), (3, 2), (2, 2)])
+def test_so_many_photographs_are_asked_for_their_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, num_asked: int
+) -> None:
+    """Every second one where all are more."""
+    model = write_run(tmp_path / "run", wrong=0)
+    monkeypatch.setattr(upright, "MAX_NUM_ASKED", most)
+    found = upright.upright_of_run(tmp_path / "run" / "sparse" / "0", model)
+    assert (found.num_asked if found else 0) == num_asked
 
 
 def test_a_damaged_store_of_features_keeps_no_model_from_being_exported(

@@ -48,7 +48,6 @@ from colmap_affrect.project.report import (
 )
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import advice as advice_module
-from colmap_affrect.report import upright
 from colmap_affrect.report.advice import advice
 from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages import match as match_stage
@@ -466,19 +465,19 @@ def test_idle_run_looks_at_no_header(
 def test_idle_run_reads_the_features_of_no_photograph_and_builds_no_networks(
     copy: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A copy has other times than its summaries name; the first run makes them again.
+    """A copy has other times than its summaries and its page name; the first run makes them again.
 
-    The page asks up to so many photographs for their lines, whose directions are not in summaries.
+    The second one finds a page that shows all that there is.
     """
-    monkeypatch.setattr(upright, "MAX_NUM_ASKED", 1)
     first = run(photos, copy.path, OPTIONS)
     feature_store._forget_summaries()
     read = Mock(wraps=feature_store._line_datasets)
     monkeypatch.setattr(feature_store, "_line_datasets", read)
     monkeypatch.setattr(feature_store, "entries_of", None)
     monkeypatch.setattr("colmap_affrect.stages.one_image.prepare", None)
+    monkeypatch.setattr("colmap_affrect.report.run_results.write_run_page", None)
     again = run(photos, copy.path, OPTIONS)
-    assert read.call_count == 1
+    assert not read.called
     assert without_times(again.to_mapping()) == without_times(first.to_mapping())
 
 
