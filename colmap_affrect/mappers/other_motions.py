@@ -98,8 +98,8 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
     poses = poses_of(model)
     strongest = strongest_of_images(graph.pairs_inside(poses), NUM_PAIRS)
     pairs = strongest[:MAX_NUM_PAIRS]
-    cameras = cameras_of(model)
     least = max(MIN_NUM_SHOWING, MIN_SHOWING * len(pairs))
+    cameras = cameras_of(model)
     contradicting = list[_Motions]()
     for pair in pairs:
         at_most = _contradicting(pair, poses, cameras, graph)
@@ -107,6 +107,19 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
             contradicting.append(at_most)
     if len(contradicting) < least:
         return 1.0  # whatever moves in them
+    showing = _showing_another_motion(contradicting)
+    if len(showing) < least:
+        return 1.0
+    num_cells = np.sum([motions.cells() for motions in showing], axis=0)
+    return float(num_cells[0] / max(num_cells.sum(), 1.0))
+
+
+def _showing_another_motion(contradicting: Collection[_Motions]) -> list[_Motions]:
+    """Return what moves in the pairs in which enough moves as one, and in other pairs, too.
+
+    Args:
+        contradicting: All matches of pairs that contradict a model.
+    """
     found = list[_Motions]()
     for at_most in contradicting:
         motions = _moving_as_one(at_most)
@@ -117,10 +130,7 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
     for motions in found:
         if motions.cells()[1] >= MIN_CELLS and motions.is_chained(num_pairs):
             showing.append(motions)
-    if len(showing) < least:
-        return 1.0
-    num_cells = np.sum([motions.cells() for motions in showing], axis=0)
-    return float(num_cells[0] / max(num_cells.sum(), 1.0))
+    return showing
 
 
 def _num_pairs_of_features(found: Collection[_Motions]) -> Features:
