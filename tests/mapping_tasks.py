@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.camera_priors import camera_priors
+from colmap_affrect.mappers.model_score import ModelScorer
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.principal_points import with_free_principal_points
+from colmap_affrect.mappers.search import Search
 from colmap_affrect.session.view_graph import ViewGraph
 
 SEED = 3
@@ -66,3 +72,18 @@ def write_images(
         frame = pycolmap.Frame(rig_id=rig_id, frame_id=image_id)
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
+
+
+def searches_with_axes(
+    path: Path, records: Mapping[int, CameraRecord]
+) -> tuple[Search, Search]:
+    """Return a search with constant principal points, and the same with free ones."""
+    task = MappingTask(path, None, cameras=records)
+    graph = PairGraph.read(path)
+    native = mapper_of("sparse").native(task, 0)
+    priors = camera_priors(graph.cameras.values(), task.cameras, {})
+    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
+    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
+    free = with_free_principal_points(constant, task.cameras)
+    assert free is not None
+    return constant, free

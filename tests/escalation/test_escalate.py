@@ -14,7 +14,6 @@ from PIL import Image
 from results import database_content
 from verified import copy_of, verified
 
-from colmap_affrect.colmap.connections import weakly_connected_images
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
@@ -230,32 +229,6 @@ def test_levels_with_features_and_matching_of_their_own(
             assert own.max() < parts[level].stop
             assert own.min() >= (parts[0].stop if level else 0)
     assert store.levels([EASY])[EASY] > 0
-
-
-def numbered(*rows: tuple[int, int]) -> np.ndarray:
-    return np.array(rows, dtype=np.int64).reshape(-1, 2)
-
-
-@pytest.mark.parametrize(("matches", "tracks"), [
-    # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
-    ({("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
-     {"a": 2, "b": 2, "c": 2}),
-    # The same numbers in another image are other features.
-    ({("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
-     {"a": 0, "b": 0, "c": 0}),
-    # d is matched with a feature of c that leads on, by one of its two matches.
-    ({("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
-     {"a": 1, "c": 1, "d": 1}),
-    ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
-    ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
-    ({}, {}),
-])  # fmt: skip
-def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(
-    matches, tracks
-) -> None:
-    for limit in range(4):
-        expected = {name for name, count in tracks.items() if count < limit}
-        assert weakly_connected_images(matches, limit) == expected
 
 
 def test_strong_pairs_without_a_track_of_three_escalate(

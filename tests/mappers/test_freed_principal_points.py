@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from mapping_tasks import mapper_of, synthesize
+from mapping_tasks import searches_with_axes, synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers import principal_points
-from colmap_affrect.mappers.adjustment import Adjuster
-from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.camera_priors import (
     CameraPrior,
-    camera_priors,
     shifted_principal_point,
     usual_principal_point,
 )
-from colmap_affrect.mappers.model_score import ModelScorer
-from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.principal_points import (
+    FreedomGains,
     _only_up_and_down,
     gains_of_freedom,
     median_turns_deg,
-    with_free_principal_points,
 )
 from colmap_affrect.mappers.search import Search
 
-# Of axes from the middle, px of images of 1024 x 768: right and down
+PARAMS = [900.0, 512.0, 384.0, 0.0]
+UNKNOWN = CameraRecord(("a",), "guess", 1200.0, size=(1024, 768))
+# Of axes from the middle, px: right and down
 OFFSETS_PX = np.array([[150, -40], [-90, 120], [30, 160], [-160, -60]], float)
 
 
@@ -92,20 +90,73 @@ def test_axes_of_whole_photographs_are_not_just_in_the_middle(
         num_rigs=len(OFFSETS_PX),
         num_points3D=200,
         noise_px=0.4,
-        camera_params=[900.0, 512.0, 384.0, 0.0],
+        camera_params=PARAMS,
     )
     for image in truth.images.values():
         for point in image.points2D:
             point.xy = point.xy + share * OFFSETS_PX[image.image_id - 1]
-    unknown = CameraRecord(("a",), "guess", 1200.0, size=(1024, 768))
-    records = dict.fromkeys(truth.cameras, unknown)
-    graph = PairGraph.read(path)
-    native = mapper_of("sparse").native(MappingTask(path, None, cameras=records), 0)
-    priors = camera_priors(graph.cameras.values(), records, {})
-    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
-    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
-    free = with_free_principal_points(constant, records)
-    assert free is not None
+    records = dict.fromkeys(truth.cameras, UNKNOWN)
+    constant, free = searches_with_axes(path, records)
     gains = gains_of_freedom(truth, constant, free)
     assert gains.num_freed == len(OFFSETS_PX)
     assert gains.contradict_constant == contradict
+
+
+@pytest.mark.parametrize(
+    ("crop_nats", "shift_nats", "contradict", "leave_open"),
+    [
+        (1.9, 0.9, False, False),
+        (2.1, 0.9, False, True),  # crops move both ways
+        (0.0, 1.1, False, True),
+        (7.9, 3.9, False, True),
+        (8.1, 3.9, True, True),
+        (0.0, 4.1, True, True),  # that is enough for a shift up or down
+    ],
+)
+def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
+    crop_nats: float, shift_nats: float, *, contradict: bool, leave_open: bool
+) -> None:
+    """Of three principal points and observations whose logarithm is eight."""
+    gains = FreedomGains(
+        by_shifts=3 * shift_nats,
+        by_crops=3 * crop_nats,
+        num_freed=3,
+        num_observations=round(math.exp(8.0)),
+    )
+    assert gains.contradict_constant == contradict
+    assert gains.leave_constant_open == leave_open
+
+
+@pytest.mark.parametrize(
+    ("gain", "by_shifts"),
+    [
+        (30.0, 20.0),
+        (3.1, 20.0),
+        (2.9, 2.9),  # a nat for each camera: shifts are not tried
+    ],
+)
+def test_gains_are_those_of_crops_and_of_shifts_up_and_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, by_shifts: float
+) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
+    constant, free = searches_with_axes(path, dict.fromkeys(truth.cameras, UNKNOWN))
+
+    def costs(search: Search, _: pycolmap.Reconstruction) -> tuple[float, float]:
+        axis = search.adjuster.priors[1].principal_point
+        assert axis is not None
+        across_px, down_px = axis.sigmas_px
+        if down_px == pytest.approx(0.02 * 1024):
+            assert across_px == pytest.approx(0.02 * 1024)
+            return 2000.0, 1000.0
+        assert down_px == pytest.approx(0.15 * 1024)
+        is_crop = across_px == pytest.approx(0.15 * 1024)
+        assert is_crop or across_px == pytest.approx(0.02 * 1024)
+        return (1000.0 - gain, 2000.0) if is_crop else (2000.0, 980.0)
+
+    monkeypatch.setattr(Search, "costs_of_starts", costs)
+    gains = gains_of_freedom(truth, constant, free)
+    assert (gains.by_shifts, gains.by_crops) == pytest.approx((by_shifts, gain))
+    assert gains.num_freed == 3
+    assert gains.num_observations == truth.compute_num_observations()
+    assert gains_of_freedom(truth, free, free).num_freed == 0

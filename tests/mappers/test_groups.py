@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from mapping_tasks import mapper_of, synthesize, task_with_given_cameras
 
 from colmap_affrect.colmap.database import open_database
@@ -48,14 +49,15 @@ def test_a_weaker_group_of_three_is_a_model_too(tmp_path: Path) -> None:
     assert sizes_of_models(path) == [5, 3]
 
 
-def test_a_group_is_mapped_by_pairs_inside_of_it_alone() -> None:
-    """Images 1 to 3 have a model; a pair that is not among the strongest ties 3 and 4."""
+@pytest.mark.parametrize("is_strong", [False, True])
+def test_a_group_is_mapped_by_pairs_inside_of_it_alone(*, is_strong: bool) -> None:
+    """Images 1 to 3 have a model; a pair ties 3 and 4, perhaps among the strongest."""
     inside = [SimpleNamespace(ids=ids) for ids in ((4, 5), (4, 6), (5, 6))]
     others = [SimpleNamespace(ids=ids) for ids in ((1, 2), (2, 3))]
     across = SimpleNamespace(ids=(3, 4))
     left_out = list[list[tuple[int, int]]]()
     graph = SimpleNamespace(
-        pairs=[*inside, *others],
+        pairs=[*inside, *others, *([across] if is_strong else [])],
         verified=[*inside, *others, across],
         without=left_out.append,
     )

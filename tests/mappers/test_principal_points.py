@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_tasks import WHOLE, mapper_of, synthesize
+from mapping_tasks import WHOLE, mapper_of, searches_with_axes, synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.mappers.adjustment import Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.camera_priors import (
     camera_prior,
-    camera_priors,
     is_off_center,
     shifted_principal_point,
 )
 from colmap_affrect.mappers.hypotheses import SHIFTED_AXES
-from colmap_affrect.mappers.model_score import ModelScorer
-from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.principal_points import (
-    FreedomGains,
     freed_principal_point_cost,
-    gains_of_freedom,
-    with_free_principal_points,
 )
-from colmap_affrect.mappers.search import Search
 
 pytestmark = pytest.mark.long
 
@@ -100,21 +91,6 @@ def relative_rotation(
 
 def center_of(camera: pycolmap.Camera) -> Array:
     return np.array([camera.principal_point_x, camera.principal_point_y])
-
-
-def searches_of(
-    path: Path, records: Mapping[int, CameraRecord]
-) -> tuple[Search, Search]:
-    """Return a search with constant principal points, and the same with free ones."""
-    task = MappingTask(path, None, cameras=records)
-    graph = PairGraph.read(path)
-    native = mapper_of("sparse").native(task, 0)
-    priors = camera_priors(graph.cameras.values(), task.cameras, {})
-    adjuster = Adjuster(priors, 0.7, native.get_global_bundle_adjustment())
-    constant = Search(adjuster, ModelScorer(graph, priors), native, 6, lambda _: None)
-    free = with_free_principal_points(constant, task.cameras)
-    assert free is not None
-    return constant, free
 
 
 def records_of(
@@ -234,7 +210,7 @@ def test_an_axis_that_mapping_moved_has_the_prior_of_a_print() -> None:
 def test_only_principal_points_that_were_freed_are_paid_for(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
-    constant, free = searches_of(path, records_of(truth, UNKNOWN))
+    constant, free = searches_with_axes(path, records_of(truth, UNKNOWN))
     first, second, third = sorted(truth.cameras)
     crop = shifted_principal_point(truth.cameras[first])
     priors = dict(constant.adjuster.priors)
@@ -248,62 +224,3 @@ def test_only_principal_points_that_were_freed_are_paid_for(tmp_path: Path) -> N
     truth.cameras[third].principal_point_y -= sigma_px
     paid = freed_principal_point_cost(truth, knows_a_crop, free)
     assert paid == pytest.approx(2.0 + 0.5)
-
-
-@pytest.mark.parametrize(
-    ("crop_nats", "shift_nats", "contradict", "leave_open"),
-    [
-        (1.9, 0.9, False, False),
-        (2.1, 0.9, False, True),  # crops move both ways
-        (0.0, 1.1, False, True),
-        (7.9, 3.9, False, True),
-        (8.1, 3.9, True, True),
-        (0.0, 4.1, True, True),  # that is enough for a shift up or down
-    ],
-)
-def test_points_must_say_more_for_crops_than_for_shifts_up_or_down(
-    crop_nats: float, shift_nats: float, *, contradict: bool, leave_open: bool
-) -> None:
-    """Of three principal points and observations whose logarithm is eight."""
-    gains = FreedomGains(
-        by_shifts=3 * shift_nats,
-        by_crops=3 * crop_nats,
-        num_freed=3,
-        num_observations=round(math.exp(8.0)),
-    )
-    assert gains.contradict_constant == contradict
-    assert gains.leave_constant_open == leave_open
-
-
-@pytest.mark.parametrize(
-    ("gain", "by_shifts"),
-    [
-        (30.0, 20.0),
-        (3.1, 20.0),
-        (2.9, 2.9),  # a nat for each camera: shifts are not tried
-    ],
-)
-def test_gains_are_those_of_crops_and_of_shifts_up_and_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, by_shifts: float
-) -> None:
-    path = tmp_path / "database.db"
-    truth = synthesize(path, num_rigs=3, num_points3D=60, camera_params=PARAMS)
-    constant, free = searches_of(path, records_of(truth, UNKNOWN))
-
-    def costs(search: Search, _: pycolmap.Reconstruction) -> tuple[float, float]:
-        axis = search.adjuster.priors[1].principal_point
-        assert axis is not None
-        across_px, down_px = axis.sigmas_px
-        if down_px == pytest.approx(0.02 * 1024):
-            assert across_px == pytest.approx(0.02 * 1024)
-            return 2000.0, 1000.0
-        assert down_px == pytest.approx(0.15 * 1024)
-        is_crop = across_px == pytest.approx(0.15 * 1024)
-        assert is_crop or across_px == pytest.approx(0.02 * 1024)
-        return (1000.0 - gain, 2000.0) if is_crop else (2000.0, 980.0)
-
-    monkeypatch.setattr(Search, "costs_of_starts", costs)
-    gains = gains_of_freedom(truth, constant, free)
-    num_observations = truth.compute_num_observations()
-    assert gains == FreedomGains(by_shifts, gain, 3, num_observations)
-    assert gains_of_freedom(truth, free, free).num_freed == 0
