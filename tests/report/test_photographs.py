@@ -188,15 +188,14 @@ def test_observations_are_those_of_pycolmap(
     for row, image in enumerate(registered_images(model)):
         marks = image.get_observation_points2D()
         is_own = seen.rows == row
-        ids = [mark.point3D_id for mark in marks]
         assert seen.names[row] == image.name
-        assert seen.point_ids[is_own].tolist() == ids
-        np.testing.assert_array_equal(seen.places[is_own], [mark.xy for mark in marks])
-        errors_px = []
-        for mark in marks:
-            projected = image.project_point(model.points3D[mark.point3D_id].xyz)
-            errors_px.append(np.linalg.norm(projected - mark.xy))
-        assert len(errors_px) > 10
+        ids = seen.point_ids[is_own].tolist()
+        assert ids == [mark.point3D_id for mark in marks]
+        assert len(ids) > 10
+        places = np.array([mark.xy for mark in marks])
+        np.testing.assert_array_equal(seen.places[is_own], places)
+        projected = [image.project_point(model.points3D[i].xyz) for i in ids]
+        errors_px = np.linalg.norm(np.array(projected) - places, axis=1)
         np.testing.assert_allclose(seen.errors_px[is_own], errors_px, atol=1e-9)
 
 
