@@ -16,6 +16,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.native_options import Plain, set_values
+from colmap_affrect.mappers.adjustment import FAST_TOLERANCE
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search
@@ -35,6 +36,9 @@ SELDOM: Mapping[str, Plain] = {
     "ba_global_points_freq": NEVER,
     # The next images adjust the same neighbours once more
     "ba_local_max_refinements": 1,
+    # All are adjusted once more with all tracks, which changes the last digits of poses most
+    "ba_local_function_tolerance": FAST_TOLERANCE,
+    "ba_global_function_tolerance": FAST_TOLERANCE,
 }
 """Options of COLMAP's pipeline for large sets, whose time then grows as their images do."""
 

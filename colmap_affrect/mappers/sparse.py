@@ -107,11 +107,13 @@ class SparseMapper(IncrementalMapper):
         if task.previous_models:
             found = restarted(search, task.previous_models)
         else:
-            seldom = self.native(task, random_seed)
-            if len(graph.keypoints) >= MIN_LARGE_SET:
-                adjust_seldom(seldom, self.options.mapper_options)
-            by_colmap = partial(self.map_by, seldom, output_path=output_path, show=show)
             thin = graph if task.extend else graph.thinned(OF_LARGE_SETS)
+            by_colmap = partial(
+                self.map_by,
+                self._native_of_colmap(task, graph, random_seed),
+                output_path=output_path,
+                show=show,
+            )
             found = large_models(task, search, thin, output_path, by_colmap)
             is_whole = found and not graph.unexplained_by(found[0].reconstruction)
             if is_whole and not task.tie_points:
@@ -126,6 +128,15 @@ class SparseMapper(IncrementalMapper):
             task.extend.restore(mapped.reconstruction)
             extract_colors(mapped.reconstruction, task, native)
         return best
+
+    def _native_of_colmap(
+        self, task: MappingTask, graph: PairGraph, random_seed: int
+    ) -> pycolmap.IncrementalPipelineOptions:
+        """Return the options of COLMAP's pipeline, which adjusts large sets seldom."""
+        native = self.native(task, random_seed)
+        if len(graph.keypoints) >= MIN_LARGE_SET:
+            adjust_seldom(native, self.options.mapper_options)
+        return native
 
     def _map_small(
         self,

@@ -20,7 +20,7 @@ from mapping_tasks import (
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.mappers import incremental, scored_models, snapshots
+from colmap_affrect.mappers import scored_models, snapshots
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
@@ -303,8 +303,7 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
 ) -> None:
     path = tmp_path / "database.db"
     synthesize(path, **SCENE)
-    for module in (incremental, snapshots):
-        monkeypatch.setattr(module, "SNAPSHOT_FRAMES", 2)
+    monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
     token = pycolmap.CancellationToken()
     task = MappingTask(path, None, cancellation=token)
     with pytest.raises(KeyboardInterrupt):
