@@ -333,6 +333,14 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "sparse"]
 
 
+@pytest.mark.parametrize(
+    ("num_images", "expected"), [(100, 100), (1000, 100), (5000, 500)]
+)
+def test_larger_sets_have_no_more_snapshots(num_images: int, expected: int) -> None:
+    """What they cost then grows as the images do, not as their square."""
+    assert snapshots.frames_between_snapshots(num_images) == expected
+
+
 def test_snapshots_of_other_options_are_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
