@@ -14,10 +14,10 @@ NUM_TRACKS = 500  # kept of each image (resource: poses are as good as with all)
 NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (resource)
 # Of the features that are kept, from which on it saves little (resource)
 MAX_SHARE = 0.5
-# The same of a large set, whose model is adjusted with all tracks in the end (resource)
-NUM_TRACKS_OF_LARGE = 200
-NUM_MATCHES_OF_PAIR_OF_LARGE = 50
-MAX_SHARE_OF_LARGE = 0.8
+# The same of large sets, whose models are adjusted with all tracks in the end
+NUM_TRACKS_OF_LARGE = 200  # of each image (resource: poses are near enough for that)
+NUM_MATCHES_OF_PAIR_OF_LARGE = 50  # of each pair at least (resource)
+MAX_SHARE_OF_LARGE = 0.8  # of the features that are kept (resource)
 
 
 @dataclass(frozen=True)
