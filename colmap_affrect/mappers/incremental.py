@@ -15,8 +15,8 @@ from colmap_affrect.errors import Option, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel
 from colmap_affrect.mappers.snapshots import (
-    SNAPSHOT_FRAMES,
     drop_old_snapshots,
+    frames_between_snapshots,
     largest_snapshot,
 )
 from colmap_affrect.options import within
@@ -93,8 +93,32 @@ class IncrementalMapper:
             AffrectError: When COLMAP ends with an error.
             KeyboardInterrupt: After mapping has been stopped.
         """
+        native = self.native(task, random_seed)
+        return self.map_by(native, task, output_path, show)
+
+    def map_by(
+        self,
+        native: pycolmap.IncrementalPipelineOptions,
+        task: MappingTask,
+        output_path: Path,
+        show: Callable[[int], None],
+    ) -> list[MappedModel]:
+        """Map once by some of pycolmap's options; otherwise as :meth:`map`.
+
+        Args:
+            native: The options.
+            task: What to map.
+            output_path: An empty folder that models are written to.
+            show: Is told how many images have been registered so far.
+
+        Returns:
+            The models.
+
+        Raises:
+            AffrectError: When COLMAP ends with an error.
+            KeyboardInterrupt: After mapping has been stopped.
+        """
         with ONE_MAPPING:
-            native = self.native(task, random_seed)
             if task.image_path is None:
                 native.extract_colors = False
             run = _PipelineRun(
@@ -166,7 +190,8 @@ class _PipelineRun:
         if not snapshots or has_own_snapshots:
             return self._map(token)
         self.options.snapshot_path = snapshots
-        self.options.snapshot_frames_freq = SNAPSHOT_FRAMES
+        num_images = len(image_ids(self.task.database_path))
+        self.options.snapshot_frames_freq = frames_between_snapshots(num_images)
         snapshot = largest_snapshot(snapshots)
         return self._resumed(snapshot, token) if snapshot else self._map(token)
 

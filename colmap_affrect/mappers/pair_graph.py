@@ -39,7 +39,11 @@ from colmap_affrect.mappers.few_matches import (
     FewMatches,
     sure_few_matches,
 )
-from colmap_affrect.mappers.thinning import MAX_SHARE, matches_of_best_tracks
+from colmap_affrect.mappers.thinning import (
+    OF_SMALL_SETS,
+    Thinning,
+    matches_of_best_tracks,
+)
 
 Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
@@ -232,15 +236,15 @@ class PairGraph:
             cameras[image_id] = cache.cameras[image.camera_id]
         return replace(self._with_pairs(self.verified, cache), cameras=cameras)
 
-    def thinned(self) -> Self:
+    def thinned(self, thinning: Thinning = OF_SMALL_SETS) -> Self:
         """Leave out tracks where the others tell the poses as well; itself where they are few.
 
-        See :mod:`colmap_affrect.mappers.thinning`.
+        See :mod:`colmap_affrect.mappers.thinning`, which says how many are kept.
         """
         matches = [(pair.ids, pair.matches) for pair in self.verified]
         num_keypoints = {i: len(points) for i, points in self.keypoints.items()}
-        best = matches_of_best_tracks(matches, num_keypoints)
-        if best.share_of_features > MAX_SHARE:
+        best = matches_of_best_tracks(matches, num_keypoints, thinning)
+        if best.share_of_features > thinning.max_share:
             return self
         thin = list[VerifiedPair]()
         for pair, is_kept in zip(self.verified, best.is_kept, strict=True):

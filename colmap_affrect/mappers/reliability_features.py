@@ -6,6 +6,7 @@ See :mod:`colmap_affrect.mappers.reliability`.
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -250,13 +251,27 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
         for pair in _strongest_to_frames(context, pairs):
             strongest[pair.ids] = pair
     found = {}
+    known = _known_rotation_ratios(context.graph)
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
     for pair in list(strongest.values())[::step]:
-        sizes = context.graph.sizes(pair.ids)
-        max_error_px = MAX_ERROR * max(map(max, sizes))
-        points1, points2 = context.graph.points(pair)
-        found[pair.ids] = pure_rotation_ratio(points1, points2, sizes, max_error_px)
+        if pair.ids not in known:
+            known[pair.ids] = _rotation_ratio(context.graph, pair)
+        found[pair.ids] = known[pair.ids]
     return found
+
+
+@lru_cache(maxsize=1)
+def _known_rotation_ratios(_: PairGraph) -> dict[Ids, float]:
+    """Return the ratios of pairs of a graph so far, to add to: models are scored many times."""
+    return {}
+
+
+def _rotation_ratio(graph: PairGraph, pair: VerifiedPair) -> float:
+    """Return the share of matches that a rotation explains, which hangs on no model."""
+    sizes = graph.sizes(pair.ids)
+    max_error_px = MAX_ERROR * max(map(max, sizes))
+    points1, points2 = graph.points(pair)
+    return pure_rotation_ratio(points1, points2, sizes, max_error_px)
 
 
 def _strongest_to_frames(

@@ -18,6 +18,9 @@ logger = logging.getLogger(__name__)
 SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many images is kept whatever comes after it, so that
 mapping can go on from a snapshot of it; resource."""
+MAX_SNAPSHOTS = 10
+"""Of one mapping: writing one takes time in proportion to the images that there are. What a kill
+loses is a tenth of a mapping at most; resource."""
 # A snapshot may be incomplete when a run is killed; the one before is complete; theory
 NUM_KEPT = 2
 
@@ -55,6 +58,15 @@ def with_snapshots(
             remove_own([folder])
         raise
     remove_own([folder])
+
+
+def frames_between_snapshots(num_images: int) -> int:
+    """Return the number of images from one snapshot to the next.
+
+    Args:
+        num_images: Of all that is mapped.
+    """
+    return max(SNAPSHOT_FRAMES, num_images // MAX_SNAPSHOTS)
 
 
 def largest_snapshot(folder: Path) -> Path | None:

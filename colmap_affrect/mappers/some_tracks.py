@@ -6,7 +6,7 @@ Mapping with a part of the tracks takes a fraction of the time: see
 
 import copy
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +15,32 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.native_options import Plain, set_values
+from colmap_affrect.mappers.adjustment import FAST_TOLERANCE
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.search import Search
 
 SOME_TRACKS = "from some of the tracks"  # what made a model, in the words of a report
+
+GROWTH_OF_LARGE = 1.4
+"""Of images or points from one adjustment of all to the next. Each takes time in proportion to its
+images, so all together take ``r / (r - 1)`` times as much as the last one: 3.5 times, with COLMAP's
+1.1 eleven times (resource). In between local adjustments keep poses where their neighbours are."""
+NEVER = 2**31 - 1  # images or points, of which so many never come; numeric
+SELDOM: Mapping[str, Plain] = {
+    "ba_global_frames_ratio": GROWTH_OF_LARGE,
+    "ba_global_points_ratio": GROWTH_OF_LARGE,
+    # COLMAP's 500 and 250,000 make the number of adjustments grow with that of images
+    "ba_global_frames_freq": NEVER,
+    "ba_global_points_freq": NEVER,
+    # The next images adjust the same neighbours once more
+    "ba_local_max_refinements": 1,
+    # All are adjusted once more with all tracks, which changes the last digits of poses most
+    "ba_local_function_tolerance": FAST_TOLERANCE,
+    "ba_global_function_tolerance": FAST_TOLERANCE,
+}
+"""Options of COLMAP's pipeline for large sets, whose time then grows as their images do."""
 
 
 def model_of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
@@ -45,6 +66,18 @@ def model_of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     if not has_all or not quick.is_certain(model, search.graph):
         return []
     return [_with_all_points(search, graph, models[0])]
+
+
+def adjust_seldom(
+    native: pycolmap.IncrementalPipelineOptions, given: Mapping[str, Plain]
+) -> None:
+    """Have COLMAP's pipeline adjust as seldom as large sets allow.
+
+    Args:
+        native: Changed in place.
+        given: What the user gives, which stays.
+    """
+    set_values(native, {key: SELDOM[key] for key in SELDOM if key not in given})
 
 
 def large_models(

@@ -26,8 +26,10 @@ from colmap_affrect.mappers.pair_graph import PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.rigs import certain_models_of_rigs
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.mappers.some_tracks import (
+    adjust_seldom,
     large_models,
 )
+from colmap_affrect.mappers.thinning import OF_LARGE_SETS
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within
 
@@ -105,13 +107,13 @@ class SparseMapper(IncrementalMapper):
         if task.previous_models:
             found = restarted(search, task.previous_models)
         else:
+            thin = graph if task.extend else graph.thinned(OF_LARGE_SETS)
             by_colmap = partial(
-                super().map,
+                self.map_by,
+                self._native_of_colmap(task, graph, random_seed),
                 output_path=output_path,
-                random_seed=random_seed,
                 show=show,
             )
-            thin = graph if task.extend else graph.thinned()
             found = large_models(task, search, thin, output_path, by_colmap)
             is_whole = found and not graph.unexplained_by(found[0].reconstruction)
             if is_whole and not task.tie_points:
@@ -126,6 +128,15 @@ class SparseMapper(IncrementalMapper):
             task.extend.restore(mapped.reconstruction)
             extract_colors(mapped.reconstruction, task, native)
         return best
+
+    def _native_of_colmap(
+        self, task: MappingTask, graph: PairGraph, random_seed: int
+    ) -> pycolmap.IncrementalPipelineOptions:
+        """Return the options of COLMAP's pipeline, which adjusts large sets seldom."""
+        native = self.native(task, random_seed)
+        if len(graph.keypoints) >= MIN_LARGE_SET:
+            adjust_seldom(native, self.options.mapper_options)
+        return native
 
     def _map_small(
         self,

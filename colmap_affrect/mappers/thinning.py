@@ -14,6 +14,28 @@ NUM_TRACKS = 500  # kept of each image (resource: poses are as good as with all)
 NUM_MATCHES_OF_PAIR = 100  # kept of each pair at least (resource)
 # Of the features that are kept, from which on it saves little (resource)
 MAX_SHARE = 0.5
+# The same of large sets, whose models are adjusted with all tracks in the end
+NUM_TRACKS_OF_LARGE = 200  # of each image (resource: poses are near enough for that)
+NUM_MATCHES_OF_PAIR_OF_LARGE = 50  # of each pair at least (resource)
+MAX_SHARE_OF_LARGE = 0.8  # of the features that are kept (resource)
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """How many tracks are kept."""
+
+    num_tracks: int = NUM_TRACKS  # of each image
+    num_matches_of_pair: int = NUM_MATCHES_OF_PAIR  # of each pair at least
+    max_share: float = MAX_SHARE
+    """Of the features that are kept: where more would be, nothing is left out."""
+
+
+OF_SMALL_SETS = Thinning()
+OF_LARGE_SETS = Thinning(
+    num_tracks=NUM_TRACKS_OF_LARGE,
+    num_matches_of_pair=NUM_MATCHES_OF_PAIR_OF_LARGE,
+    max_share=MAX_SHARE_OF_LARGE,
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +49,9 @@ class BestTracks:
 
 
 def matches_of_best_tracks(
-    pairs: Sequence[tuple[tuple[int, int], Indices]], num_keypoints: Mapping[int, int]
+    pairs: Sequence[tuple[tuple[int, int], Indices]],
+    num_keypoints: Mapping[int, int],
+    thinning: Thinning = OF_SMALL_SETS,
 ) -> BestTracks:
     """Choose the matches of the best tracks of each image and of each pair.
 
@@ -36,6 +60,7 @@ def matches_of_best_tracks(
     Args:
         pairs: Image ids, and (M, 2) features that match.
         num_keypoints: Number of features by image id.
+        thinning: How many are kept.
 
     Returns:
         Their matches.
@@ -51,18 +76,20 @@ def matches_of_best_tracks(
     track_of = _connected_components(edges, num_all)
     image_of = np.repeat(np.arange(len(image_ids)), counts)
     matched = np.unique(edges)
-    views = np.stack([track_of[matched], image_of[matched]])
-    tracks, images = np.unique(views, axis=1)
+    views = np.unique(track_of[matched] * len(image_ids) + image_of[matched])
+    tracks, images = np.divmod(views, len(image_ids))
     num_features = np.bincount(track_of[matched], minlength=num_all)
     num_images = np.bincount(tracks, minlength=num_all)
     ranks = _ranks(num_features, num_images)
     is_kept = np.zeros(num_all, bool)
-    for index in range(len(image_ids)):
-        tracks_of_image = tracks[images == index]
-        is_kept[_best(tracks_of_image, ranks, NUM_TRACKS)] = True
+    # Tracks by image, and those of one image by their numbers
+    by_image = tracks[np.argsort(images, kind="stable")]
+    ends = np.cumsum(np.bincount(images, minlength=len(image_ids)))
+    for tracks_of_image in np.split(by_image, ends[:-1]):
+        is_kept[_best(tracks_of_image, ranks, thinning.num_tracks)] = True
     tracks_of_pairs = [track_of[of_pair[:, 0]] for of_pair in matches]
     for tracks_of_pair in tracks_of_pairs:
-        is_kept[_best(tracks_of_pair, ranks, NUM_MATCHES_OF_PAIR)] = True
+        is_kept[_best(tracks_of_pair, ranks, thinning.num_matches_of_pair)] = True
     return BestTracks(
         is_kept=[is_kept[tracks_of_pair] for tracks_of_pair in tracks_of_pairs],
         share_of_features=float(is_kept[track_of[matched]].mean()),

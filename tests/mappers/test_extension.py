@@ -20,7 +20,7 @@ from mapping_tasks import (
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.mappers import incremental, scored_models, snapshots
+from colmap_affrect.mappers import scored_models, snapshots
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database
@@ -303,8 +303,7 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
 ) -> None:
     path = tmp_path / "database.db"
     synthesize(path, **SCENE)
-    for module in (incremental, snapshots):
-        monkeypatch.setattr(module, "SNAPSHOT_FRAMES", 2)
+    monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
     token = pycolmap.CancellationToken()
     task = MappingTask(path, None, cancellation=token)
     with pytest.raises(KeyboardInterrupt):
@@ -332,6 +331,14 @@ def test_mapping_that_was_stopped_goes_on_from_its_snapshot(
     assert shown[0] == len(names)
     assert sum(shown) == len(model.registered_names) == NUM_IMAGES
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "sparse"]
+
+
+@pytest.mark.parametrize(
+    ("num_images", "expected"), [(100, 100), (1000, 100), (5000, 500)]
+)
+def test_larger_sets_have_no_more_snapshots(num_images: int, expected: int) -> None:
+    """What they cost then grows as the images do, not as their square."""
+    assert snapshots.frames_between_snapshots(num_images) == expected
 
 
 def test_snapshots_of_other_options_are_dropped(

@@ -5,7 +5,8 @@ from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -27,11 +28,20 @@ from colmap_affrect.mappers.pair_graph import (
     compared_with_pose,
     poses_of,
 )
-from colmap_affrect.mappers.some_tracks import SOME_TRACKS
+from colmap_affrect.mappers.some_tracks import (
+    GROWTH_OF_LARGE,
+    NEVER,
+    SELDOM,
+    SOME_TRACKS,
+    adjust_seldom,
+)
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 from colmap_affrect.mappers.thinning import (
     NUM_MATCHES_OF_PAIR,
+    NUM_MATCHES_OF_PAIR_OF_LARGE,
     NUM_TRACKS,
+    NUM_TRACKS_OF_LARGE,
+    OF_LARGE_SETS,
     _ranks,
     matches_of_best_tracks,
 )
@@ -89,6 +99,40 @@ def test_features_say_how_many_tracks_are_left_out_not_matches() -> None:
     assert num_kept > sum(map(len, best.is_kept)) / 2
 
 
+def test_large_sets_have_fewer_tracks_of_each_image_and_pair(path: Path) -> None:
+    graph = PairGraph.read(path)
+    thin = graph.thinned(OF_LARGE_SETS)
+    num_of_small = sum(len(pair.matches) for pair in graph.thinned().pairs)
+    assert sum(len(pair.matches) for pair in thin.pairs) < num_of_small / 2
+    for pair in thin.pairs:
+        assert len(pair.matches) >= NUM_MATCHES_OF_PAIR_OF_LARGE
+    assert min(map(len, features_of_pairs(thin).values())) >= NUM_TRACKS_OF_LARGE
+
+
+def test_large_sets_are_adjusted_seldom_but_as_the_user_says() -> None:
+    given = {"ba_global_points_ratio": 1.2}
+    native = pycolmap.IncrementalPipelineOptions(ba_global_points_ratio=1.2)
+    adjust_seldom(native, given)
+    assert native.ba_global_points_ratio == 1.2
+    assert native.ba_global_frames_ratio == GROWTH_OF_LARGE
+    assert native.ba_global_frames_freq == native.ba_global_points_freq == NEVER
+    assert native.ba_local_max_refinements == 1
+    assert native.check()
+
+
+@pytest.mark.parametrize("num_images", [99, 100])
+def test_only_large_sets_are_adjusted_seldom_by_colmap(num_images: int) -> None:
+    """Also where they are extended, which COLMAP does with small ones, too."""
+    mapper = SparseMapper(SparseOptions())
+    keypoints = dict.fromkeys(range(num_images), np.zeros((0, 2), np.float32))
+    graph = cast("PairGraph", SimpleNamespace(keypoints=keypoints))
+    task = MappingTask(Path("database.db"), None)
+    native = mapper._native_of_colmap(task, graph, 0)
+    usual = mapper.native(task, 0)
+    for key in SELDOM:
+        assert (getattr(native, key) == getattr(usual, key)) == (num_images == 99)
+
+
 def test_a_thinned_graph_has_its_tracks_whole(path: Path) -> None:
     graph = PairGraph.read(path)
     thin = graph.thinned()
@@ -117,19 +161,20 @@ def test_colmap_maps_a_large_set_from_some_of_the_tracks(
     monkeypatch.setattr(sparse, "MIN_LARGE_SET", NUM_IMAGES)
     task = task_with_given_cameras(path)
     num_inliers = []
-    by_colmap = IncrementalMapper.map
+    by_colmap = IncrementalMapper.map_by
 
     def map_and_count(
-        mapper: IncrementalMapper, task: MappingTask, *others: Any, **named: Any
+        mapper: IncrementalMapper, native: Any, task: MappingTask, **named: Any
     ) -> list[MappedModel]:
+        assert native.ba_global_frames_ratio == GROWTH_OF_LARGE
         with open_database(task.database_path) as database:
             num_inliers.append(database.num_inlier_matches())
-        return by_colmap(mapper, task, *others, **named)
+        return by_colmap(mapper, native, task, **named)
 
-    monkeypatch.setattr(IncrementalMapper, "map", map_and_count)
+    monkeypatch.setattr(IncrementalMapper, "map_by", map_and_count)
     (model,) = SparseMapper(SparseOptions()).map(task, tmp_path, 0, lambda _: None)
     assert model.hypotheses == (SOME_TRACKS,)
-    thin = PairGraph.read(path).thinned()
+    thin = PairGraph.read(path).thinned(OF_LARGE_SETS)
     assert num_inliers == [sum(len(pair.matches) for pair in thin.verified)]
     assert list(tmp_path.glob("**/*.db")) == []
     num_thin = len(set().union(*features_of_pairs(thin).values()))

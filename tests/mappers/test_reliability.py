@@ -98,6 +98,27 @@ def test_an_image_from_the_same_viewpoint_does_not_agree_with_a_pose(
     assert features_of(mapped, task)[name].agreement < 0.2
 
 
+def test_what_no_pose_changes_is_found_once_for_a_pair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where many images leave a large model, it is scored as many times."""
+    mapped, task = scene(tmp_path)
+    found = list[float]()
+    ratio_of = reliability_features.pure_rotation_ratio
+
+    def counted(*arguments: Any) -> float:
+        found.append(ratio_of(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(reliability_features, "pure_rotation_ratio", counted)
+    first = features_of(mapped, task)
+    num_found = len(found)
+    again = features_of(mapped, task)
+    assert len(found) == num_found > 0
+    for name, one in first.items():
+        assert one.pure_rotation_ratio == again[name].pure_rotation_ratio
+
+
 def test_every_term_takes_from_the_probability_and_says_why(tmp_path: Path) -> None:
     mapped, task = scene(tmp_path)
     good = features_of(mapped, task)[last(mapped).name]
