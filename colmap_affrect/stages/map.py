@@ -137,11 +137,11 @@ def _make_mapped_database(
 def line_cameras(context: Context) -> dict[str, LineCamera]:
     """Return what the straight lines of photographs say of their cameras, by image name.
 
-    None of photographs whose focal length is known, nor of those that have hardly any lines.
+    None of photographs whose focal length the user gives, nor of those that have hardly any lines.
     """
     names = list[str]()
     for record in read_camera_records(context.workspace.cameras).values():
-        if record.source == "guess":
+        if record.source != "given":
             names.extend(record.names)
     found = dict[str, LineCamera]()
     findings = context.features.line_findings() if names else {}

@@ -24,7 +24,11 @@ from verified import CAMERAS, copy_of
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
-from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
+from colmap_affrect.colmap.cameras import (
+    Source,
+    read_camera_records,
+    write_camera_records,
+)
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
@@ -156,12 +160,15 @@ def test_report_and_page_say_what_lines_were_found(finished: Finished) -> None:
     assert 'id="lines"' in workspace.page.read_text(encoding="utf-8")
 
 
-def test_lines_are_asked_for_cameras_that_nobody_knows_alone(copy: Workspace) -> None:
+@pytest.mark.parametrize("source", ["guess", "exif"])
+def test_lines_are_asked_for_cameras_that_the_user_does_not_give(
+    copy: Workspace, source: Source
+) -> None:
     context = Context(copy)
     assert line_cameras(context) == {}
     records = read_camera_records(copy.cameras)
-    unknown = {key: replace(r, source="guess", given=()) for key, r in records.items()}
-    write_camera_records(copy.cameras, unknown)
+    not_given = {key: replace(r, source=source, given=()) for key, r in records.items()}
+    write_camera_records(copy.cameras, not_given)
     store = FeatureStore(copy.features)
     for name in NAMES:
         lines = store.lines_of([name]).get(name)
