@@ -162,37 +162,43 @@ def _significant_geometry(
 
     Its inliers are rows, twice. None where there are too few of them, or chance made them.
     """
+    search = _search_options(keypoints, options)
+    geometry = _searched_geometry(cameras, keypoints, options, search)
+    if geometry is None or not options.min_significance:
+        return geometry
+    if len(geometry.inlier_matches) >= MAX_FEW_INLIERS:
+        return geometry
+    # The same samples, and others after them
+    search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
+    return _searched_geometry(cameras, keypoints, options, search) or geometry
+
+
+def _searched_geometry(
+    cameras: Cameras,
+    keypoints: Keypoints,
+    options: VerificationOptions,
+    search: pycolmap.TwoViewGeometryOptions,
+) -> pycolmap.TwoViewGeometry | None:
+    """Return what one search finds, as :func:`_significant_geometry` does."""
     num_matches = len(keypoints[0])
     rows = _twice(np.arange(num_matches, dtype=np.uint32))
     points = (_positions(keypoints[0]), _positions(keypoints[1]))
-    search = _search_options(keypoints, options)
+    geometry = pycolmap.estimate_two_view_geometry(
+        cameras[0], points[0], cameras[1], points[1], rows, search
+    )
     min_num_inliers = max(
         options.min_num_inliers, options.min_inlier_ratio * num_matches
     )
-
-    def searched() -> pycolmap.TwoViewGeometry | None:
-        found = pycolmap.estimate_two_view_geometry(
-            cameras[0], points[0], cameras[1], points[1], rows, search
-        )
-        # Of a geometry that it rejects the estimator returns the inliers all the same.
-        is_rejected = found.config in REJECTED
-        has_too_few = len(found.inlier_matches) < min_num_inliers
-        return None if is_rejected or has_too_few else found
+    # Of a geometry that it rejects the estimator returns the inliers all the same.
+    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
+        return None
 
     def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
         of_chance = significance(found, cameras, keypoints, options.max_error_px)
         return of_chance < options.min_significance
 
-    geometry = searched()
-    if geometry is None or not options.min_significance:
+    if not options.min_significance or not is_chance(geometry):
         return geometry
-    if not is_chance(geometry):
-        if len(geometry.inlier_matches) >= MAX_FEW_INLIERS:
-            return geometry
-        # The same samples, and others after them
-        search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
-        longer = searched()
-        return geometry if longer is None or is_chance(longer) else longer
     planar = _planar_geometry(geometry, points, options)
     if len(planar.inlier_matches) < min_num_inliers or is_chance(planar):
         return None

@@ -32,6 +32,7 @@ from colmap_affrect.colmap.cameras import (
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.geometry.lines import SHIFTED_SIGMA
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.camera_priors import FocalContradiction
@@ -175,6 +176,25 @@ def test_lines_are_asked_for_cameras_that_the_user_does_not_give(
         said = lines.camera() if lines else None
         found = line_cameras(context).get(name)
         assert (found and found.focal) == (said and said.focal)
+
+
+def test_the_lines_of_crops_say_what_they_say_wherever_the_axis_is(
+    copy: Workspace,
+) -> None:
+    """With the axis in the middle they would be surer of a focal length than they are."""
+    records = read_camera_records(copy.cameras)
+    crops = {
+        key: replace(r, source="guess", given=(), uncropped_px=1000.0)
+        for key, r in records.items()
+    }
+    write_camera_records(copy.cameras, crops)
+    store = FeatureStore(copy.features)
+    found = line_cameras(Context(copy))
+    assert found
+    for name, by_lines in found.items():
+        free = store.lines_of([name])[name].camera(SHIFTED_SIGMA)
+        assert free
+        assert (by_lines.focal, by_lines.shift_sigma) == (free.focal, free.shift_sigma)
 
 
 def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
