@@ -34,7 +34,8 @@ Source = Literal["given", "exif", "exif-rescaled", "guess", "model"]
 reports only, of a model that is extended."""
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""
-TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
+EXIF_SOURCES: tuple[Source, ...] = ("exif", "exif-rescaled")
+TRUSTED: tuple[Source, ...] = ("given", *EXIF_SOURCES)
 """Sources whose focal lengths are priors before any pair has been verified."""
 
 

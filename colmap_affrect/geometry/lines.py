@@ -41,8 +41,9 @@ NUM_KEPT = 3  # of these, which are refined for each focal length; resource
 # Of the angle between planes that meet in a direction of a first frame; numeric
 MIN_SINE = 1e-3
 NUM_STEPS = 5  # of refinement without a shift; resource
-# Of refinement for each distortion, and for each shift, from there; resource
-NUM_STEPS_FROM_THERE = 3
+NUM_STEPS_FROM_THERE = 3  # of refinement for each distortion, from there; resource
+# Of refinement for each shift, from the shift beside it; resource
+NUM_STEPS_FROM_BESIDE = 2
 # Lines that count as one piece of evidence: what is built errs together; fitted
 TEMPER = 3.0
 MODEL_SIGMA = 0.05
@@ -357,18 +358,49 @@ def line_likelihood(segments: Segments) -> LineLikelihood | None:
     if len(segments) < MIN_NUM_SEGMENTS:
         return None
     lens = _likeliest_lens(segments)
-    grid = (len(FOCALS), len(SHIFTS))
-    rotations, scores = refined(
-        segments=segments.undistorted(lens.distortion),
-        rotations=np.repeat(lens.rotations, len(SHIFTS), axis=0),
-        focals=np.repeat(FOCALS, len(SHIFTS)),
-        shifts=np.tile(SHIFTS, len(FOCALS)),
-        num_steps=NUM_STEPS_FROM_THERE,
-    )
-    log_likelihoods = (scores.reshape(grid) + lens.of_others[:, None]) / TEMPER
-    return LineLikelihood(
-        log_likelihoods, rotations.reshape(*grid, 3, 3), lens.distortion
-    )
+    straight = segments.undistorted(lens.distortion)
+    rotations, scores = _rotations_of_shifts(straight, lens.rotations)
+    log_likelihoods = (scores + lens.of_others[:, None]) / TEMPER
+    return LineLikelihood(log_likelihoods, rotations, lens.distortion)
+
+
+def _rotations_of_shifts(segments: Segments, centred: Floats) -> tuple[Floats, Floats]:
+    """Return the rotations that explain most for each focal length and shift, and how much.
+
+    A camera with a shifted axis is turned otherwise than one without. So the rotation of each
+    shift is sought from that of the shift beside it, from the middle outwards: from the middle
+    itself many are not found, and shifts then seem less likely than they are.
+
+    Args:
+        segments: of the photograph, undistorted.
+        centred: (F, 3, 3) rotations without a shift.
+
+    Returns:
+        (F, S, 3, 3) rotations, and (F, S) log-likelihood ratios against chance alone.
+    """
+    num_focals = len(FOCALS)
+    rotations = np.empty((num_focals, len(SHIFTS), 3, 3))
+    scores = np.empty((num_focals, len(SHIFTS)))
+    middle = len(SHIFTS) // 2
+    starts = {middle: centred}
+    for distance in range(middle + 1):
+        columns = sorted({middle - distance, middle + distance})
+        found, of_found = refined(
+            segments=segments,
+            rotations=np.concatenate([starts[column] for column in columns]),
+            focals=np.tile(FOCALS, len(columns)),
+            shifts=np.repeat(SHIFTS[columns], num_focals),
+            num_steps=NUM_STEPS_FROM_BESIDE,
+        )
+        for number, column in enumerate(columns):
+            part = slice(number * num_focals, (number + 1) * num_focals)
+            rotations[:, column] = found[part]
+            scores[:, column] = of_found[part]
+        starts = {
+            middle - distance - 1: rotations[:, middle - distance],
+            middle + distance + 1: rotations[:, middle + distance],
+        }
+    return rotations, scores
 
 
 @dataclass(frozen=True)

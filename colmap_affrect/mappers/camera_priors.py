@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
+from colmap_affrect.colmap.cameras import EXIF_SOURCES, TRUSTED, CameraRecord
 from colmap_affrect.geometry import lines as line_model
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.lines import (
@@ -239,9 +239,12 @@ def camera_prior(
     is_trusted = camera.has_prior_focal_length
     if record:
         is_trusted = record.source in TRUSTED
-    if is_trusted:
-        return CameraPrior(focal_px, EXIF_SIGMA)
     longer_px = max(camera.width, camera.height)
+    if is_trusted:
+        told = LogNormal(focal_px / longer_px, EXIF_SIGMA)
+        if record and record.source in EXIF_SOURCES:
+            told = _with_lines(told, lines)
+        return CameraPrior(told.focal * longer_px, told.sigma)
     measurements = _measurements_of_lines(lines)
     usual = USUAL
     if record and record.uncropped_px:
@@ -254,6 +257,32 @@ def camera_prior(
         principal_point=_principal_point(camera, record, lines),
         given_starts_px=_starts(focal),
     )
+
+
+def _with_lines(by_exif: LogNormal, lines: Sequence[LineCamera]) -> LogNormal:
+    """Combine the focal length by EXIF with what lines measure, where these do not contradict it.
+
+    Lines may mislead, the more likely the further they are from EXIF: then EXIF alone counts.
+
+    Args:
+        by_exif: In longer sides.
+        lines: What the lines of the images of a camera say.
+    """
+    by_lines = _focal_by_lines(lines)
+    if by_lines is None or _contradict(by_exif, by_lines):
+        return by_exif
+    of_one_building = max(by_lines.sigma, LINES_SIGMA)
+    measured = Measurement(replace(by_lines, sigma=of_one_building), LYING_LINES)
+    both = combined(by_exif, [measured])
+    # Lines that are in doubt make nobody less sure of EXIF.
+    return replace(both, sigma=min(both.sigma, by_exif.sigma))
+
+
+def _contradict(by_exif: LogNormal, by_lines: LogNormal) -> bool:
+    """Tell whether lines that know a focal length differ by more than both may be wrong."""
+    difference = math.log(by_exif.focal / by_lines.focal)
+    tolerated = MAX_DEVIATIONS * math.hypot(by_lines.sigma, by_exif.sigma)
+    return by_lines.sigma < KNOWN_SIGMA and abs(difference) > tolerated
 
 
 def _starts(focal_px: LogNormal) -> tuple[float, ...]:
@@ -398,26 +427,30 @@ def focal_contradictions(
         if record is None or record.source not in TRUSTED:
             continue
         by_lines = _focal_by_lines(_lines_of_images(record, lines))
-        lines_px = by_lines.focal * max(camera.width, camera.height)
+        longer_px = max(camera.width, camera.height)
         said_px = float(camera.mean_focal_length())
-        difference = math.log(said_px / lines_px)
-        tolerated = MAX_DEVIATIONS * math.hypot(by_lines.sigma, EXIF_SIGMA)
-        if by_lines.sigma < KNOWN_SIGMA and abs(difference) > tolerated:
+        said = LogNormal(said_px / longer_px, EXIF_SIGMA)
+        if by_lines and _contradict(said, by_lines):
             found.append(
                 FocalContradiction(
                     names=record.names,
                     source=record.source,
                     said_px=said_px,
-                    lines_px=lines_px,
+                    lines_px=by_lines.focal * longer_px,
                     lines_sigma=by_lines.sigma,
                 )
             )
     return found
 
 
-def _focal_by_lines(lines: Iterable[LineCamera]) -> LogNormal:
-    """Return the focal length of a camera, in longer sides, as if no lines could be false."""
+def _focal_by_lines(lines: Iterable[LineCamera]) -> LogNormal | None:
+    """Return the focal length of a camera, in longer sides, as if no lines could be false.
+
+    None where lines say nothing.
+    """
     certain = list[Measurement]()
     for measured in _measurements_of_lines(lines):
         certain.append(replace(measured, false_share=NO_SHARE))
+    if not certain:
+        return None
     return combined(LogNormal(USUAL_FOCAL, WIDE_SIGMA), certain)

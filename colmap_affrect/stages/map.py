@@ -11,7 +11,7 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import model_folder
 from colmap_affrect.colmap.verification import verify
 from colmap_affrect.errors import ConflictError, Option
-from colmap_affrect.geometry.lines import LineCamera
+from colmap_affrect.geometry.lines import SHIFTED_SIGMA, LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.mappers.mapping import map_database, read_models, read_summaries
@@ -137,19 +137,23 @@ def _make_mapped_database(
 def line_cameras(context: Context) -> dict[str, LineCamera]:
     """Return what the straight lines of photographs say of their cameras, by image name.
 
-    None of photographs whose focal length is known, nor of those that have hardly any lines.
+    None of photographs whose focal length the user gives, nor of those that have hardly any lines.
+    Optical axes of crops may be anywhere, whatever the lines say of that.
     """
-    names = list[str]()
+    not_given = list[str]()
+    crops = list[str]()
     for record in read_camera_records(context.workspace.cameras).values():
-        if record.source == "guess":
-            names.extend(record.names)
-    found = dict[str, LineCamera]()
-    findings = context.features.line_findings() if names else {}
-    for name in names:
-        lines = findings.get(name)
-        if lines and lines.camera:
-            found[name] = lines.camera
-    return found
+        if record.source != "given":
+            not_given.extend(record.names)
+        if record.uncropped_px:
+            crops.extend(record.names)
+    cameras = dict[str, LineCamera | None]()
+    findings = context.features.line_findings() if not_given else {}
+    for name in sorted(findings.keys() & not_given):
+        cameras[name] = findings[name].camera
+    for name, lines in context.features.lines_of(crops).items():
+        cameras[name] = lines.camera(SHIFTED_SIGMA)
+    return {name: camera for name, camera in cameras.items() if camera}
 
 
 def unmeasured_pairs(context: Context) -> list[Pair]:

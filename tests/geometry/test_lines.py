@@ -191,6 +191,30 @@ def test_a_building_with_the_axis_in_the_middle_is_not_called_shifted() -> None:
     assert free.shift == pytest.approx(0.0, abs=0.06)
 
 
+@pytest.mark.parametrize("shift", [-0.2, 0.25])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_shifted_camera_is_as_likely_as_its_true_rotation_makes_it(
+    shift: float, seed: int
+) -> None:
+    """From the rotation without a shift it was not found, and seemed as good as chance."""
+    building = Building(focal=1.2, shift=shift)
+    segments = Segments.of_image(building.edges(seed), SIZE)
+    found = line_cameras.line_likelihood(segments)
+    assert found is not None
+    row = int(np.abs(FOCALS - 1.2).argmin())
+    column = int(np.abs(SHIFTS - shift).argmin())
+    _, scores = refined(
+        segments=segments.undistorted(found.distortion),
+        rotations=building.rotation.T[None],
+        focals=FOCALS[[row]],
+        shifts=SHIFTS[[column]],
+        num_steps=10,
+    )
+    from_truth = float(scores[0]) / line_cameras.TEMPER
+    assert found.log_likelihoods[row, column] > from_truth - 2.0
+    assert found.rotations.shape == (len(FOCALS), len(SHIFTS), 3, 3)
+
+
 def test_segments_are_undistorted_as_colmap_does() -> None:
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.3, 1, 1)
     camera.params = [1.3, 0.0, 0.0, -0.15 * 1.3**2]

@@ -95,10 +95,66 @@ def test_lines_tell_an_unknown_focal_length_and_leave_a_known_one_as_it_is() -> 
     assert LINES_SIGMA <= prior.sigma < 0.2
     assert not prior.has_prior_focal_length
     assert prior.starts_px == (prior.focal_px,)
-    exif = replace(NOTHING, source="exif")
-    assert camera_prior(camera(), exif, said) == CameraPrior(1200.0, EXIF_SIGMA)
     given = replace(NOTHING, source="given", given=("focal",))
     assert camera_prior(camera(), given, said) == CameraPrior(1200.0, 0.0)
+
+
+def with_exif(
+    difference: float, sigma: float, num_images: int = 1, source: str = "exif"
+) -> CameraPrior:
+    """Return the prior where lines differ from EXIF by a logarithm."""
+    exif = replace(NOTHING, source=source)
+    said = [with_usual(1.2 * math.exp(difference), sigma)] * num_images
+    return camera_prior(camera(), exif, said)
+
+
+@pytest.mark.parametrize("source", ["exif", "exif-rescaled"])
+@pytest.mark.parametrize(("difference", "sigma"), [
+    (0.0, 0.1), (0.1, 0.1), (-0.12, 0.12), (0.08, 0.2),
+])  # fmt: skip
+def test_exif_and_lines_that_agree_are_multiplied(
+    difference: float, sigma: float, source: str
+) -> None:
+    """Lines that lie in a tenth of all photographs count a little less than others."""
+    prior = with_exif(difference, sigma, source=source)
+    precision = EXIF_SIGMA**-2 + sigma**-2
+    product = math.exp(difference * sigma**-2 / precision) * 1200.0
+    assert math.log(prior.focal_px / product) == pytest.approx(0.0, abs=0.012)
+    assert prior.sigma == pytest.approx(precision**-0.5, rel=0.06)
+    assert prior.has_prior_focal_length
+
+
+def test_lines_of_many_images_count_no_more_beside_exif_than_lines_may_be_wrong() -> (
+    None
+):
+    precision = EXIF_SIGMA**-2 + LINES_SIGMA**-2
+    many = with_exif(0.1, 0.06, num_images=20)
+    assert many.sigma == pytest.approx(precision**-0.5, rel=0.05)
+    moved = math.log(many.focal_px / 1200.0)
+    assert moved == pytest.approx(0.1 * LINES_SIGMA**-2 / precision, abs=0.008)
+
+
+def test_lines_that_contradict_exif_or_say_little_leave_it_as_it_is() -> None:
+    assert with_exif(0.4, 0.1) == CameraPrior(pytest.approx(1200.0), EXIF_SIGMA)
+    vague = with_exif(0.3, 0.45)
+    assert vague.focal_px == pytest.approx(1200.0, rel=0.02)
+    assert 0.95 * EXIF_SIGMA < vague.sigma <= EXIF_SIGMA
+    doubtful = with_exif(0.3, 0.1)
+    assert doubtful.sigma <= EXIF_SIGMA
+    assert math.log(doubtful.focal_px / 1200.0) < 0.1
+    exif = replace(NOTHING, source="exif")
+    assert camera_prior(camera(), exif) == CameraPrior(
+        pytest.approx(1200.0), EXIF_SIGMA
+    )
+
+
+def test_what_the_user_gives_is_not_combined_with_lines() -> None:
+    """Neither a focal length that stays nor, of databases, one that is only trusted."""
+    said = [by_lines(0.9)]
+    given = replace(NOTHING, source="given", given=("focal",))
+    assert camera_prior(camera(), given, said) == CameraPrior(1200.0, 0.0)
+    trusted = replace(NOTHING, source="given")
+    assert camera_prior(camera(), trusted, said).focal_px == pytest.approx(1200.0)
 
 
 def test_lines_of_many_images_leave_a_tenth_of_a_focal_length_open() -> None:

@@ -24,10 +24,15 @@ from verified import CAMERAS, copy_of
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
-from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
+from colmap_affrect.colmap.cameras import (
+    Source,
+    read_camera_records,
+    write_camera_records,
+)
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.geometry.lines import SHIFTED_SIGMA
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.camera_priors import FocalContradiction
@@ -155,18 +160,40 @@ def test_report_and_page_say_what_lines_were_found(finished: Finished) -> None:
     assert 'id="lines"' in workspace.page.read_text(encoding="utf-8")
 
 
-def test_lines_are_asked_for_cameras_that_nobody_knows_alone(copy: Workspace) -> None:
+@pytest.mark.parametrize("source", ["guess", "exif"])
+def test_lines_are_asked_for_cameras_that_the_user_does_not_give(
+    copy: Workspace, source: Source
+) -> None:
     context = Context(copy)
     assert line_cameras(context) == {}
     records = read_camera_records(copy.cameras)
-    unknown = {key: replace(r, source="guess", given=()) for key, r in records.items()}
-    write_camera_records(copy.cameras, unknown)
+    not_given = {key: replace(r, source=source, given=()) for key, r in records.items()}
+    write_camera_records(copy.cameras, not_given)
     store = FeatureStore(copy.features)
     for name in NAMES:
         lines = store.lines_of([name]).get(name)
         said = lines.camera() if lines else None
         found = line_cameras(context).get(name)
         assert (found and found.focal) == (said and said.focal)
+
+
+def test_the_lines_of_crops_say_what_they_say_wherever_the_axis_is(
+    copy: Workspace,
+) -> None:
+    """With the axis in the middle they would be surer of a focal length than they are."""
+    records = read_camera_records(copy.cameras)
+    crops = {
+        key: replace(r, source="guess", given=(), uncropped_px=1000.0)
+        for key, r in records.items()
+    }
+    write_camera_records(copy.cameras, crops)
+    store = FeatureStore(copy.features)
+    found = line_cameras(Context(copy))
+    assert found
+    for name, by_lines in found.items():
+        free = store.lines_of([name])[name].camera(SHIFTED_SIGMA)
+        assert free
+        assert (by_lines.focal, by_lines.shift_sigma) == (free.focal, free.shift_sigma)
 
 
 def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
