@@ -115,11 +115,15 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     with monkeypatch.context() as patch:
         patch.setattr(escalation.matches, "write", killed)
         with pytest.raises(KeyboardInterrupt):
-            escalation.match_at(own, 1)
+            escalation.match_at(own, 1, 0.75)
+    tally = context.matches.state.tally
+    assert tally
+    assert (tally.promised, tally.open) == (0.0, 0.75)
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
-    escalation.match_at(own[2:], 1)
+    escalation.match_at(own[2:], 1, 0.75)
+    assert context.matches.state.tally == tally
     assert min(escalation.state.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 
