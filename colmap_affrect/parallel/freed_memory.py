@@ -9,8 +9,11 @@ TRIM_THRESHOLD = -1
 MMAP_THRESHOLD = -3
 ARENA_MAX = -8
 # Arrays up to this size, of a photograph or a layer of a network, are taken from memory that was
-# freed before, of which so much is kept; resource
-KEPT_BYTES = 1 << 29
+# freed before; resource
+MAX_ARRAY_BYTES = 1 << 30
+# Freed memory that is kept; ALIKED frees 1.1 GB of a megapixel, and a network wants it again for
+# the next photograph; resource
+KEPT_BYTES = (1 << 31) - 1
 
 
 def keep_freed_memory() -> None:
@@ -22,7 +25,7 @@ def keep_freed_memory() -> None:
     if sys.platform == "linux":
         with suppress(AttributeError):  # another C library than GNU's
             change = ctypes.CDLL(None).mallopt
-            change(MMAP_THRESHOLD, KEPT_BYTES)
+            change(MMAP_THRESHOLD, MAX_ARRAY_BYTES)
             change(TRIM_THRESHOLD, KEPT_BYTES)
             change(ARENA_MAX, 1)
 
