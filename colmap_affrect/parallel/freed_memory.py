@@ -4,10 +4,10 @@ import ctypes
 import sys
 from contextlib import suppress
 
-# As glibc's malloc.h has them
-TRIM_THRESHOLD = -1
-MMAP_THRESHOLD = -3
-ARENA_MAX = -8
+# Of glibc's malloc.h
+TRIM_THRESHOLD = -1  # format
+MMAP_THRESHOLD = -3  # format
+ARENA_MAX = -8  # format
 # Arrays up to this size, of a photograph or a layer of a network, are taken from memory that was
 # freed before; resource
 MAX_ARRAY_BYTES = 1 << 30
