@@ -291,7 +291,7 @@ class Escalation:
         """
         if pairs and not self.matches.state.step:
             tally = self.state.tally(self.state.models())
-            promised = replace(tally, open=tally.open + photographs)
+            promised = replace(tally, open=max(tally.open, photographs))
             begun = Begun(level, tuple(pairs))
             self.matches.update_state(step=begun, has_stepped=True, tally=promised)
         known = self._use_learned_matches(pairs, level)

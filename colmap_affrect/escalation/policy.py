@@ -42,7 +42,7 @@ SMALL = 30
 MIN_PHOTOGRAPHS = 0.2
 # Photographs that steps may promise in vain until half as much is believed of the next one: two
 # aged sets were promised 13 and got none; measured
-PATIENCE = 0.5
+PATIENCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,7 @@ def trust(tally: Tally | None) -> float:
     Chances are those of pairs, whatever the set: where many photographs show another place, or a
     side that nothing ties, steps verify pairs and save nothing.
 
-    >>> trust(None), trust(Tally(3.0, 3.0)), trust(Tally(3.0, 3.0, promised=1.5))
+    >>> trust(None), trust(Tally(3.0, 3.0)), trust(Tally(3.0, 3.0, promised=3.0))
     (1.0, 1.0, 0.25)
     >>> trust(Tally(3.0, 4.0, promised=1.0))
     1.0

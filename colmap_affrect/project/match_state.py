@@ -56,7 +56,9 @@ class Tally:
     best: float  # most of them in models since
     promised: float = 0.0
     """Photographs that steps were expected to save, of steps that models have followed since."""
-    open: float = 0.0  # the same of steps that none has followed yet
+    open: float = 0.0
+    """Most that one step was expected to save that none has followed yet: several of these are for
+    the same photographs."""
 
     def judged(self, score: float) -> "Tally":
         """Return the tally once models have followed all steps, which have a score."""
