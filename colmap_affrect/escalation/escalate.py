@@ -17,7 +17,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from colmap_affrect.colmap.verification import PairVerifier
@@ -230,7 +230,7 @@ class Escalation:
         while step:
             before_each()
             start = time.perf_counter()
-            self.match_at(step.pairs, step.level, step.photographs)
+            self.match_at(step.pairs, step.level)
             self.add_to_report(time.perf_counter() - start, len(step.pairs))
             step = self.next_step()
 
@@ -277,9 +277,7 @@ class Escalation:
         }
         return [StageWarning("no_weights", "learned matching", values)]
 
-    def match_at(
-        self, pairs: Sequence[Pair], level: int, photographs: float = 0.0
-    ) -> None:
+    def match_at(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers.
 
         What is to be done is on record meanwhile, so that an interrupted run can resume.
@@ -287,13 +285,9 @@ class Escalation:
         Args:
             pairs: of image names.
             level: number of the level in the recipe.
-            photographs: that are expected to be saved.
         """
-        if pairs and not self.matches.state.step:
-            tally = self.state.tally(self.state.models())
-            promised = replace(tally, open=max(tally.open, photographs))
-            begun = Begun(level, tuple(pairs))
-            self.matches.update_state(step=begun, has_stepped=True, tally=promised)
+        if pairs:
+            self.matches.update_state(step=Begun(level, tuple(pairs)), has_stepped=True)
         known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)

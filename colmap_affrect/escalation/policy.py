@@ -6,8 +6,7 @@
    many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
-   nothing is likely to help. What steps have brought so far says how far to believe what is
-   expected of the next one (:func:`trust`).
+   nothing is likely to help.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
 as any other.
@@ -30,7 +29,6 @@ from colmap_affrect.forecast import Forecast
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
-from colmap_affrect.project.match_state import Tally
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
@@ -40,9 +38,6 @@ SMALL = 30
 # Photographs expected of all that the budget allows, below which nothing is tried; judged on the
 # same sets, by where photographs right against seconds are flat
 MIN_PHOTOGRAPHS = 0.2
-# Photographs that steps may promise in vain until half as much is believed of the next one: two
-# aged sets were promised 13 and got none; measured
-PATIENCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +91,6 @@ class Situation:
         lacking: images without features of a level, by level.
         registered: images of the largest model.
         strong_num_inliers: pairs with as many inliers need nothing more.
-        tally: what steps were expected to bring, and have brought; None before the first one.
     """
 
     levels: Sequence[Level]
@@ -109,7 +103,6 @@ class Situation:
     lacking: Sequence[Collection[str]]
     registered: Collection[str] = ()
     strong_num_inliers: int = 100
-    tally: Tally | None = None
 
     @property
     def is_small(self) -> bool:
@@ -301,35 +294,11 @@ def learned_step(situation: Situation) -> Step:
     return Step(number, lacking if needed and is_cheap else needed)
 
 
-def trust(tally: Tally | None) -> float:
-    """Return the part of what is expected of a step that is believed.
-
-    Chances are those of pairs, whatever the set: where many photographs show another place, or a
-    side that nothing ties, steps verify pairs and save nothing.
-
-    >>> trust(None), trust(Tally(3.0, 3.0)), trust(Tally(3.0, 3.0, promised=3.0))
-    (1.0, 1.0, 0.25)
-    >>> trust(Tally(3.0, 4.0, promised=1.0))
-    1.0
-    """
-    if not tally:
-        return 1.0
-    brought = tally.best - tally.before
-    return min(1.0, (PATIENCE + brought) / (PATIENCE + tally.promised))
-
-
-def is_hopeful(step: Step, situation: Situation, believed: float = 1.0) -> bool:
-    """Tell whether a level is worth a try; while nothing is registered, each is.
-
-    Args:
-        step: of the level.
-        situation: what is known of the set.
-        believed: part of what is expected of the step.
-    """
+def is_hopeful(step: Step, situation: Situation) -> bool:
+    """Tell whether a level is worth a try; while nothing is registered, each is."""
     if not step.pairs:
         return False
-    photographs = believed * step.all_photographs
-    return photographs >= MIN_PHOTOGRAPHS or not situation.registered
+    return step.all_photographs >= MIN_PHOTOGRAPHS or not situation.registered
 
 
 @dataclass(frozen=True)
@@ -359,12 +328,10 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
         learned = learned_step(situation)
         if learned.pairs:
             return Plan(learned, max(0.0, left_s) + situation.first_model_s)
-    # A greater effort is one that goes on nevertheless.
-    believed = 1.0 if effort == "high" else trust(situation.tally)
     hopeful = list[Step]()
     for number in situation.usable:
         step = situation.best_step(number, left_s)
-        if is_hopeful(step, situation, believed):
+        if is_hopeful(step, situation):
             hopeful.append(step)
     if not hopeful:
         return Plan()

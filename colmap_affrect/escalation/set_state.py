@@ -13,12 +13,8 @@ from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import MIN_LARGE_SET
 from colmap_affrect.mappers.wrong_models import read_thrown_away
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.match_state import Size, Tally
-from colmap_affrect.project.report import (
-    NO_MODEL,
-    ModelSummary,
-    expected_right_poses,
-)
+from colmap_affrect.project.match_state import Size
+from colmap_affrect.project.report import NO_MODEL, ModelSummary
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages.match import num_consistent
@@ -195,20 +191,7 @@ class SetState:
             lacking=self._lacking_by_level(sizes),
             registered=models[0].registered_names,
             strong_num_inliers=self.options.strong_num_inliers,
-            tally=self.tally(models),
         )
-
-    def tally(self, models: Sequence[ModelSummary]) -> Tally:
-        """Return what steps were expected to bring, and what models say that they have brought.
-
-        Args:
-            models: those that are there.
-        """
-        score = 0.0
-        for model in models:
-            score += expected_right_poses(model.probabilities.values())
-        known = self.context.matches.state.tally or Tally(before=score, best=score)
-        return known.judged(score) if self._is_mapped() else known
 
     def _megapixels_by_level(self, sizes: Mapping[str, Size]) -> list[dict[str, float]]:
         """Return how large each image is when features of a level are extracted."""

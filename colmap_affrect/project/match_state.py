@@ -49,27 +49,6 @@ class LearnedModels:
 
 
 @dataclass(frozen=True)
-class Tally:
-    """What steps of escalation were expected to bring, and what they have brought."""
-
-    before: float  # relative poses expected to be right before the first step
-    best: float  # most of them in models since
-    promised: float = 0.0
-    """Photographs that steps were expected to save, of steps that models have followed since."""
-    open: float = 0.0
-    """Most that one step was expected to save that none has followed yet: several of these are for
-    the same photographs."""
-
-    def judged(self, score: float) -> "Tally":
-        """Return the tally once models have followed all steps, which have a score."""
-        return Tally(
-            before=self.before,
-            best=max(self.best, score),
-            promised=self.promised + self.open,
-        )
-
-
-@dataclass(frozen=True)
 class MatchState:
     """What is known of all pairs together."""
 
@@ -95,8 +74,6 @@ class MatchState:
     """The step of escalation that has begun and not ended."""
     has_stepped: bool = False
     """Whether any step has begun."""
-    tally: Tally | None = None
-    """What steps were expected to bring, and have brought; None before the first one."""
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
 

@@ -13,7 +13,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import Step
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.project.match_state import Tally, Worth
+from colmap_affrect.project.match_state import Worth
 from colmap_affrect.project.match_store import PairMatches
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import ModelSummary
@@ -115,13 +115,11 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     with monkeypatch.context() as patch:
         patch.setattr(escalation.matches, "write", killed)
         with pytest.raises(KeyboardInterrupt):
-            escalation.match_at(own, 1, 0.75)
+            escalation.match_at(own, 1)
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
-    escalation.match_at(own[2:], 1, 0.75)
-    promised_once = Tally(before=0.0, best=0.0, open=0.75)
-    assert context.matches.state.tally == promised_once
+    escalation.match_at(own[2:], 1)
     assert min(escalation.state.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 

@@ -26,7 +26,6 @@ from colmap_affrect.escalation.policy import (
     untried_by_level,
 )
 from colmap_affrect.pairs.lists import Pair
-from colmap_affrect.project.match_state import Tally
 from colmap_affrect.recipes import load_recipe
 
 LEVELS = load_recipe("default").levels
@@ -291,30 +290,3 @@ def test_the_level_that_saves_most_photographs_per_second_comes_next(
     slow = replace(steps[1], all_seconds=1000.0)
     monkeypatch.setitem(steps, 1, slow)
     assert next_step(situation(), "normal").left_s == 120.0
-
-
-def test_what_steps_promised_in_vain_is_believed_no_more() -> None:
-    """Chances of pairs know nothing of the set: where steps brought nothing, others hardly will."""
-    hopeful = situation()
-    expected = next_step(hopeful, "normal").step.all_photographs
-    assert policy.MIN_PHOTOGRAPHS < expected < 2.5
-    in_vain = Tally(before=2.0, best=2.0, promised=20.0 * policy.PATIENCE)
-    assert not next_step(replace(hopeful, tally=in_vain), "normal").step.pairs
-    kept = replace(in_vain, best=2.0 + in_vain.promised)
-    assert next_step(replace(hopeful, tally=kept), "normal").step.pairs
-    assert next_step(replace(hopeful, tally=in_vain), "high").step.pairs
-    assert untried_by_level(replace(hopeful, tally=in_vain))
-    nothing = replace(hopeful, tally=in_vain, registered=[])
-    assert next_step(nothing, "normal").step.pairs
-
-
-def test_a_step_is_judged_once_a_model_has_followed_it() -> None:
-    tally = Tally(before=2.0, best=2.0, open=1.5)
-    assert policy.trust(tally) == 1.0
-    judged = tally.judged(2.0)
-    assert judged == Tally(before=2.0, best=2.0, promised=1.5)
-    assert policy.trust(judged) < 1.0
-    better = replace(judged, open=0.5).judged(4.0)
-    assert better == Tally(before=2.0, best=4.0, promised=2.0)
-    assert policy.trust(better) == 1.0
-    assert better.judged(1.0).best == 4.0

@@ -25,7 +25,6 @@ from colmap_affrect.mappers.wrong_models import (
     ThrownAway,
     write_thrown_away,
 )
-from colmap_affrect.project.match_state import MatchState, Tally
 from colmap_affrect.project.match_store import PairMatches
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, ModelSummary
@@ -131,13 +130,9 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
         levels=lambda *_: {},
         measured_worths=lambda _: {},
         learned_levels=lambda _: {},
-        state=MatchState(tally=Tally(before=0.5, best=1.5, promised=2.0, open=1.0)),
     )
     found = state.situation({}, one_model())
     assert list(found.usable) == [1, 3]
-    assert found.tally == Tally(before=0.5, best=1.5, promised=3.0)
-    context.current_model_inputs = lambda: "others"
-    assert state.tally(one_model()) == context.matches.state.tally
     assert found.registered == ("a",)
 
 
