@@ -29,6 +29,7 @@ from colmap_affrect.errors import (
     say,
     with_flags,
 )
+from colmap_affrect.parallel.freed_memory import keep_freed_memory
 from colmap_affrect.parallel.subprocesses import end_with
 
 # That a command has to end after Ctrl-C or SIGTERM, before it is killed; resource
@@ -283,6 +284,7 @@ def _work(began_s: float, tell_begin: Callable[[], None] | None = None) -> NoRet
         began_s: when the process began, of the monotonic clock.
         tell_begin: tells a parent that all is loaded; None where there is no parent.
     """
+    keep_freed_memory()
     interrupts = _Interrupts()
     is_loaded = threading.Event()
     code: int | str | None

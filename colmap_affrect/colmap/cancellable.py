@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.parallel.executor import return_freed_memory
+from colmap_affrect.parallel.freed_memory import return_freed_memory
 
 Result = TypeVar("Result")
 POLL_S = 0.2  # resource: how long it takes at most to notice

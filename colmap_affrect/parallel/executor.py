@@ -4,7 +4,6 @@ An :class:`Executor` says where: in threads of this process (:class:`Threads`), 
 a cluster (:mod:`colmap_affrect.parallel.cluster`). Results do not depend on it.
 """
 
-import ctypes
 import os
 import sys
 from collections import deque
@@ -100,13 +99,6 @@ def peak_memory_bytes() -> int:
     of_others = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     unit_bytes = 1 if sys.platform == "darwin" else 1024
     return unit_bytes * max(own, of_others)
-
-
-def return_freed_memory() -> None:
-    """Give freed memory back to the system, of which the C library of Linux keeps much."""
-    if sys.platform == "linux":
-        with suppress(AttributeError):  # another C library than GNU's
-            ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager

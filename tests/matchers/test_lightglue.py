@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +29,7 @@ from colmap_affrect.matchers.lightglue import (
     load_network,
     merged_matches,
     network_inputs,
+    split_off_beginning,
     unwarped_points,
 )
 
@@ -183,6 +186,46 @@ def test_fused_attention_tells_each_image_what_kornia_tells_it(count: int) -> No
     for found, known in zip(fused, expected, strict=True):
         torch.testing.assert_close(found, known, atol=1e-5, rtol=1e-5)
     assert (fused[0] - first).abs().max() > 0.1
+
+
+def test_what_an_image_says_alone_is_asked_once_for_all_of_its_pairs(
+    comparing: Path,
+) -> None:
+    options = LightGlueOptions()
+    whole = load_network(comparing, options)
+    split = load_network(comparing, options)
+    torch.manual_seed(0)
+    for name, value in whole.state_dict().items():
+        if "self_attn" in name or "posenc" in name:
+            value.copy_(0.02 * torch.randn(value.shape))
+            split.state_dict()[name].copy_(value)
+    one, other = (network_inputs(features(30, seed), SIZE) for seed in (1, 2))
+    begin = split_off_beginning(split)
+    with torch.inference_mode():
+        expected = whole({"image0": one, "image1": other})
+        begun = [{**side, "descriptors": begin(side)} for side in (one, other)]
+        found = split({"image0": begun[0], "image1": begun[1]})
+    assert not torch.equal(
+        begun[0]["descriptors"], whole.input_proj(one["descriptors"])
+    )
+    assert_array_equal(found["log_assignment"], expected["log_assignment"])
+
+
+def test_an_image_begins_once(
+    matcher: LightGlue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = list[int]()
+    begin = matcher._begin
+
+    def counted(inputs: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        begun.append(len(inputs["keypoints"][0]))
+        return begin(inputs)
+
+    monkeypatch.setattr(matcher, "_begin", counted)
+    images = [matcher.prepare(image(features(count, count))) for count in (20, 30, 40)]
+    for first, second in combinations(images, 2):
+        matcher.match(first, second)
+    assert sorted(begun) == [20, 30, 40]
 
 
 def test_another_network_of_kornia_stays_as_it_is() -> None:
