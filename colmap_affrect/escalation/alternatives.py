@@ -149,12 +149,12 @@ def choose_learned(escalation: Escalation, *, at_once: bool) -> bool:
 
 
 def _choice_of_learned_matches(escalation: Escalation) -> Choice:
-    states = escalation.state.states()
+    states = escalation.image_set.states()
     learned = escalation.matches.learned(list(states))
     levels = {pair: found.matches.level for pair, found in learned.items()}
     changed = [pair for pair, level in levels.items() if states[pair].level != level]
     measured = [
-        pair for pair in changed if escalation.state.is_measured[states[pair].level]
+        pair for pair in changed if escalation.image_set.is_measured[states[pair].level]
     ]
     worths = {pair: states[pair].worth for pair in measured}
     return Choice([learned[pair].matches for pair in changed], worths)
@@ -278,7 +278,7 @@ def restore_best(escalation: Escalation) -> bool:
     if num_right_poses_of_best(context) <= num_right_poses_now(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
-    pairs = list(escalation.state.num_inliers())
+    pairs = list(escalation.image_set.num_inliers())
     levels = context.matches.levels(pairs)
     changed = [p for p, level in before.levels(pairs).items() if level != levels[p]]
     choice = Choice(list(before.read(changed)), before.measured_worths(changed))

@@ -5,7 +5,7 @@ Images get the features that a level of the recipe adds, and pairs are matched a
 two-view geometry has more inliers, or, where neither is verified, when more of them confirm each
 other. Which pairs are matched again, and at which level, is decided anew after every step
 (:mod:`colmap_affrect.escalation.policy`), by what is known then
-(:mod:`colmap_affrect.escalation.set_state`); the step that has begun is on record, so that a killed
+(:mod:`colmap_affrect.escalation.image_set`); the step that has begun is on record, so that a killed
 run goes on in the same way.
 
 Images are matched again that are missing in the model, or that it is not sure of. While there is
@@ -23,6 +23,7 @@ from functools import cached_property
 from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.errors import Logged, such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
+from colmap_affrect.escalation.image_set import ImageSet
 from colmap_affrect.escalation.policy import (
     Plan,
     learned_step,
@@ -30,7 +31,6 @@ from colmap_affrect.escalation.policy import (
     next_step,
     untried_by_level,
 )
-from colmap_affrect.escalation.set_state import SetState
 from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
@@ -98,7 +98,7 @@ def escalation_summary(context: Context) -> EscalationSummary:
     if workspace.is_foreign or "escalate" not in workspace.started_stages:
         return EscalationSummary()
     escalation = Escalation(context, context.escalation)
-    state = escalation.state
+    state = escalation.image_set
     models = state.models()
     weights = state.weights(models)
     if not (weights or escalation.has_begun):  # large sets take long to go through
@@ -155,7 +155,7 @@ class Escalation:
             options: which pairs are strong.
         """
         self.context = context
-        self.state = SetState(context, options)
+        self.image_set = ImageSet(context, options)
         self.matches = context.matches
         self.left_s = 0.0
         self.report = StageReport(name="escalate", wall_s=0.0, num_done=0)
@@ -205,7 +205,7 @@ class Escalation:
 
     def _left_of(self, begun: Begun) -> list[Pair]:
         """Return the pairs of a step that has begun for which its level was not tried yet."""
-        tried_levels = self.matches.levels(self.state.pairs, "tried")
+        tried_levels = self.matches.levels(self.image_set.pairs, "tried")
         left = list[Pair]()
         for pair in self._allowed(begun.pairs):
             was_tried = tried_levels.get(pair, -1) >> begun.level & 1
@@ -214,11 +214,11 @@ class Escalation:
         return left
 
     def _plan(self) -> Plan:
-        models = self.state.models()
-        weights = self.state.weights(models)
+        models = self.image_set.models()
+        weights = self.image_set.weights(models)
         if not weights:
             return Plan()
-        return next_step(self.state.situation(weights, models), self.context.effort)
+        return next_step(self.image_set.situation(weights, models), self.context.effort)
 
     def take_steps(self, before_each: Callable[[], None] = lambda: None) -> None:
         """Take steps until none is left.
@@ -267,7 +267,7 @@ class Escalation:
         commands = resources.commands_to_complete(self.context.extraction)
         if not commands:
             return []
-        left = sorted(self.state.weights(self.state.models()))
+        left = sorted(self.image_set.weights(self.image_set.models()))
         if not left:
             return []
         values: dict[str, int | str] = {
@@ -310,7 +310,7 @@ class Escalation:
                 learned.append(one)
         if not learned:
             return set()
-        states = self.state.states()
+        states = self.image_set.states()
         trials = list[Trial]()
         for one in learned:
             trials.append(
@@ -332,11 +332,11 @@ class Escalation:
         """
         if self.matches.state.learned_matching:
             return True
-        models = self.state.models()
-        weights = self.state.weights(models)
+        models = self.image_set.models()
+        weights = self.image_set.weights(models)
         if not weights:
             return False
-        situation = self.state.situation(weights, models)
+        situation = self.image_set.situation(weights, models)
         if not situation.is_small:
             return False
         step = learned_step(situation)
@@ -382,7 +382,7 @@ class Escalation:
 
     def write(self) -> None:
         """Bring the database up to what is stored, and verify what is new."""
-        update_verified(self.context, self.state.pairs, replaces=True)
+        update_verified(self.context, self.image_set.pairs, replaces=True)
 
     def _match_with(self, pairs: Sequence[Pair], level: int, keep: Keep) -> None:
         """Give images the features of a level that they lack, and match pairs with these."""
@@ -444,7 +444,7 @@ class Escalation:
             options=context.verification,
             extracted_px=size_px,
         )
-        states = self.state.states()
+        states = self.image_set.states()
 
         def trial_of(found: PairMatches) -> Trial:
             return Trial(
@@ -485,8 +485,8 @@ class Escalation:
         """Return what the best measured matches are worth of pairs that use learned ones."""
         worths = dict[Pair, Worth]()
         for trial in batch:
-            was_measured = self.state.is_measured[trial.before.level]
-            is_measured = self.state.is_measured[trial.found.level]
+            was_measured = self.image_set.is_measured[trial.before.level]
+            is_measured = self.image_set.is_measured[trial.found.level]
             if was_measured and not is_measured and trial.is_better:
                 worths[trial.found.names] = trial.before.worth
             elif is_measured and not was_measured:

@@ -120,7 +120,7 @@ class PairGraph:
     cameras: CameraById  # as in the database
     keypoints: Mapping[int, Singles]  # (N, 2) px by image id, of the images of pairs
     pairs: Pairs  # sorted by ids
-    weak: Pairs  # that are not among the strongest, and in the cache only
+    unscored: Pairs  # that are not among the strongest, and in the cache only
     min_num_matches: int  # pairs with fewer inliers are left out
     raw_matches: dict[Ids, Indices] = field(default_factory=dict)
     """Raw (M, 2) matches of the strongest pairs, where a database was read."""
@@ -164,14 +164,14 @@ class PairGraph:
         keypoints = {}
         for image_id in _images_of(verified):
             keypoints[image_id] = _read_positions(database, image_id)
-        strong, weak = _split_by_strength(verified)
+        scored, unscored = _split_by_strength(verified)
         return cls(
             cache=pycolmap.DatabaseCache.create(database, options),
             names=names_of_images(database),
             cameras=cameras_of_images(database),
             keypoints=keypoints,
-            pairs=strong,
-            weak=weak,
+            pairs=scored,
+            unscored=unscored,
             min_num_matches=min_num_matches,
         )
 
@@ -211,7 +211,7 @@ class PairGraph:
     @property
     def verified(self) -> Pairs:
         """All pairs, also those that are not among the strongest."""
-        return self.pairs + self.weak
+        return self.pairs + self.unscored
 
     @property
     def has_rigs(self) -> bool:
@@ -268,8 +268,8 @@ class PairGraph:
         new.correspondence_graph.finalize()
         used = _images_of(kept)
         keypoints = {i: points for i, points in self.keypoints.items() if i in used}
-        strong, weak = _split_by_strength(kept)
-        return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
+        best, rest = _split_by_strength(kept)
+        return replace(self, cache=new, keypoints=keypoints, pairs=best, unscored=rest)
 
     def points(self, pair: VerifiedPair) -> tuple[Array, Array]:
         """Return the (M, 2) px of the inliers in both images."""
@@ -542,11 +542,11 @@ def strongest_of_images(
 
 def _split_by_strength(pairs: Collection[VerifiedPair]) -> tuple[Pairs, Pairs]:
     """Return the ``MAX_PAIRS_OF_IMAGE`` strongest pairs of each image, by ids, and the others."""
-    strong = strongest_of_images(pairs, MAX_PAIRS_OF_IMAGE)
-    strong.sort(key=lambda pair: pair.ids)
-    ids_of_strong = {pair.ids for pair in strong}
-    weak = [pair for pair in _by_strength(pairs) if pair.ids not in ids_of_strong]
-    return tuple(strong), tuple(weak)
+    scored = strongest_of_images(pairs, MAX_PAIRS_OF_IMAGE)
+    scored.sort(key=lambda pair: pair.ids)
+    scored_ids = {pair.ids for pair in scored}
+    unscored = [pair for pair in _by_strength(pairs) if pair.ids not in scored_ids]
+    return tuple(scored), tuple(unscored)
 
 
 def _read_positions(database: pycolmap.Database, image_id: int) -> Singles:

@@ -237,7 +237,7 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
         odds = _odds_of_two_scenes(features)
         num_inliers = features.num_cut_pair_inliers
         edge = Doubt(
-            "bridge_edge", {"num_inliers": num_inliers, "pair": features.cut_pair}
+            "tied_by_one_pair", {"num_inliers": num_inliers, "pair": features.cut_pair}
         )
         losses.append(_Loss(math.log1p(odds), edge))
     losses += _losses_by_other_cameras(features)
@@ -247,7 +247,7 @@ def _other_losses(features: ReliabilityFeatures) -> list[_Loss]:
         losses.append(_Loss(-math.log(share), near))
     if features.axis_turn_deg:
         share = share_within_limit(features.axis_turn_deg)
-        unclear = Doubt("axis_unclear", {"turn_deg": features.axis_turn_deg})
+        unclear = Doubt("principal_point_open", {"turn_deg": features.axis_turn_deg})
         losses.append(_Loss(-math.log(share), unclear))
     return losses
 

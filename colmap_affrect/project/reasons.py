@@ -19,9 +19,9 @@ DoubtCode = Literal[
     "mirrored_copy",
     "focal_spread",
     "tie_points_disagree",
-    "bridge_edge",
+    "tied_by_one_pair",
     "near_others",
-    "axis_unclear",
+    "principal_point_open",
     "camera_shared",
     "cameras_differ",
     "principal_point_contradicted",
@@ -49,12 +49,12 @@ SENTENCES: dict[DoubtCode, str] = {
         "parts of others"
     ),
     "tie_points_disagree": "its tie points disagree",
-    "bridge_edge": "with others it hangs on the {num_inliers} inliers of {pair} alone",
+    "tied_by_one_pair": "with others it hangs on the {num_inliers} inliers of {pair} alone",
     "near_others": (
         "it stands so near to others that the direction between them may be off by "
         "{sigma_deg:.0f} degrees"
     ),
-    "axis_unclear": (
+    "principal_point_open": (
         "points do not tell where the optical axes of photographs are: its rotation may be off by "
         "{turn_deg:.0f} degrees"
     ),

@@ -36,7 +36,7 @@ from colmap_affrect.escalation.alternatives import (
     restore_best,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin, escalation_summary
-from colmap_affrect.escalation.set_state import SetState
+from colmap_affrect.escalation.image_set import ImageSet
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
@@ -83,9 +83,9 @@ def matched(
     )
     escalation = begin(Context(workspace), recipe.escalate)
     escalation.matches.update_state(
-        learned_matching=Begun(1, tuple(escalation.state.pairs))
+        learned_matching=Begun(1, tuple(escalation.image_set.pairs))
     )
-    assert escalation.match_learned() == len(escalation.state.pairs)
+    assert escalation.match_learned() == len(escalation.image_set.pairs)
     return workspace
 
 
@@ -152,12 +152,12 @@ def test_step_takes_matches_that_are_kept_and_matches_nothing_anew(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     escalation = escalation_of(context)
-    (pair, *_) = escalation.state.pairs
+    (pair, *_) = escalation.image_set.pairs
     without_matches(escalation, pair)
     (kept,) = context.matches.learned([pair]).values()
     monkeypatch.setattr("colmap_affrect.escalation.escalate.matched_at_level", None)
     escalation.match_at([pair], 1)
-    state = escalation.state.states()[pair]
+    state = escalation.image_set.states()[pair]
     assert (state.level, state.num_inliers, state.tried) == (1, kept.worth[0], 0b11)
     assert (state.measured_worth, state.learned_level) == ((0, 0), 1)
 
@@ -184,8 +184,8 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     there = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.6))
     better = replace(UNSURE, probabilities=dict.fromkeys(NAMES, 0.85))
     asked = with_models(monkeypatch, found=better, there=[there])
-    learned = context.matches.learned(list(escalation.state.pairs))
-    before = escalation.state.states()
+    learned = context.matches.learned(list(escalation.image_set.pairs))
+    before = escalation.image_set.states()
     map_learned_matches(escalation, mapper)
     assert len(asked) == 1
     assert not choose_learned(
@@ -208,7 +208,7 @@ def test_better_learned_models_are_chosen_and_are_what_the_database_holds(
     assert levels(context) == {1}
     for pair, kept in learned.items():
         assert_array_equal(stored_matches(context, pair), kept.matches.indices)
-    for pair, state in escalation.state.states().items():
+    for pair, state in escalation.image_set.states().items():
         assert state.measured_worth == before[pair].worth
     assert not choose_learned(escalation, at_once=False)  # that is decided
 
@@ -287,7 +287,7 @@ def made_worse(workspace: Workspace, mapper: Mapper) -> Escalation:
     keep_best(context)
     more = context.features.read(NAMES[1]).select(np.arange(7))
     context.features.extend(NAMES[1], more, 2)
-    for pair in escalation.state.pairs:
+    for pair in escalation.image_set.pairs:
         if NAMES[0] in pair:
             (there,) = escalation.matches.read([pair])
             none = replace(
@@ -335,7 +335,7 @@ def test_best_models_and_their_matches_come_back(
         assert after[table] == before[table]
     assert levels(context) == {0}
     assert_same_with_all_keypoints(workspace, old)
-    tried = context.matches.levels(escalation.state.pairs, "tried")
+    tried = context.matches.levels(escalation.image_set.pairs, "tried")
     assert {levels for pair, levels in tried.items() if NAMES[0] in pair} == {0b11}
     assert (
         map_images(context, mapper, begins_with_models=True)[0].num_done == 0
@@ -418,15 +418,15 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
 ) -> None:
     """Images may have got features: what is needed would look different."""
     escalation = escalation_of(context)
-    pairs = list(escalation.state.pairs)
+    pairs = list(escalation.image_set.pairs)
     context.matches.update_state(learned_matching=None)
-    monkeypatch.setattr(SetState, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
     assert not escalation.plan_learned_matching()  # all have learned matches
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
     assert escalation.plan_learned_matching()
-    monkeypatch.setattr(SetState, "weights", lambda *_: {})
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: {})
     assert escalation.plan_learned_matching()
     assert not escalation.has_all_learned_matches
     monkeypatch.setattr(Escalation, "is_over_time", True)
@@ -456,12 +456,12 @@ def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Also the copy of the workspace is mapped here."""
-    weights = SetState.weights
+    weights = ImageSet.weights
 
-    def unsure(state: SetState, models: Sequence[ModelSummary]) -> dict[str, float]:
+    def unsure(state: ImageSet, models: Sequence[ModelSummary]) -> dict[str, float]:
         return weights(state, models) or dict.fromkeys(NAMES, 1e-3)
 
-    monkeypatch.setattr(SetState, "weights", unsure)
+    monkeypatch.setattr(ImageSet, "weights", unsure)
     workspace = verified(photos, tmp_path / "out", recipe.name)
     context = Context(workspace)
     with workspace.locked():
@@ -493,7 +493,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
     """Mapping their matches a second time might end elsewhere."""
     spaces = [copy_of(matched, tmp_path / name) for name in ("whole", "killed")]
     monkeypatch.setattr(LearnedModels, "is_enough", True)
-    monkeypatch.setattr(SetState, "weights", lambda *_: {NAMES[0]: 1.0})
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
     map_and_rematch.map_and_rematch(whole, mapper, recipe)

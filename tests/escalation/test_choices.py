@@ -259,7 +259,7 @@ def test_learned_matches_are_used_of_the_level_that_is_asked_for(
     stores.learned = lambda _: learned
     before = PairState(20, 5)
     monkeypatch.setattr(
-        escalation.state, "states", lambda: dict.fromkeys(learned, before)
+        escalation.image_set, "states", lambda: dict.fromkeys(learned, before)
     )
     kept = list[tuple[Any, int]]()
     monkeypatch.setattr(

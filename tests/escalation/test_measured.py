@@ -79,13 +79,13 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     model = ModelSummary(
         names, 9, 2.0, 0.5, doubtful={NAMES[0]: (Doubt("few_matches"),)}
     )
-    assert escalation.state._anchored(model, states) == set(NAMES) - {NAMES[3]}
+    assert escalation.image_set._anchored(model, states) == set(NAMES) - {NAMES[3]}
     all_doubtful = replace(
         model, doubtful=dict.fromkeys(names, (Doubt("few_matches"),))
     )
-    assert escalation.state._anchored(all_doubtful, states) == set()
+    assert escalation.image_set._anchored(all_doubtful, states) == set()
     without = replace(model, registered_names=names[1:])
-    assert names[0] not in escalation.state._anchored(without, states)
+    assert names[0] not in escalation.image_set._anchored(without, states)
     assert all(NAMES[3] in pair for pair in own)
 
 
@@ -120,7 +120,7 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
     escalation.match_at(own[2:], 1)
-    assert min(escalation.state.num_inliers()[pair] for pair in own) > 30
+    assert min(escalation.image_set.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 
 

@@ -38,13 +38,13 @@ def complete(
     path: Path,
     tie_points: TiePoints = NO_TIE_POINTS,
     *,
-    all_weak: bool = False,
+    all_unscored: bool = False,
 ) -> None:
     native = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     native.triangulation.ignore_two_view_tracks = False
     graph = PairGraph.read(path)
-    if all_weak:
-        graph = replace(graph, pairs=(), weak=graph.pairs)
+    if all_unscored:
+        graph = replace(graph, pairs=(), unscored=graph.pairs)
     complete_points(model, graph, native, NOISE_PX, tie_points)
 
 
@@ -110,9 +110,9 @@ def test_points_that_stood_badly_are_moved(tmp_path: Path) -> None:
     assert model.compute_mean_reprojection_error() == pytest.approx(least, rel=0.01)
 
 
-@pytest.mark.parametrize("all_weak", [False, True])
+@pytest.mark.parametrize("all_unscored", [False, True])
 def test_pair_that_contradicts_the_model_makes_no_points(
-    tmp_path: Path, *, all_weak: bool
+    tmp_path: Path, *, all_unscored: bool
 ) -> None:
     """Neither does one that is not among the strongest of its images."""
     path = tmp_path / "database.db"
@@ -128,14 +128,14 @@ def test_pair_that_contradicts_the_model_makes_no_points(
                 shifted[:, 1] = np.roll(shifted[:, 1], 7)
                 geometry.inlier_matches = shifted
                 database.write_two_view_geometry(*ids, geometry)
-    complete(model, path, all_weak=all_weak)
+    complete(model, path, all_unscored=all_unscored)
     assert model.num_points3D() == 0
 
 
 def test_pairs_that_are_not_among_the_strongest_make_points_too(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     model = placed(path)
-    complete(model, path, all_weak=True)
+    complete(model, path, all_unscored=True)
     assert model.num_points3D() >= 195
 
 

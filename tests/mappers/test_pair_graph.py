@@ -322,7 +322,7 @@ def test_only_the_strongest_pairs_of_an_image_score_models(tmp_path: Path) -> No
     graph = PairGraph.read(tmp_path / "database.db")
     counts = Counter(image_id for pair in graph.pairs for image_id in pair.ids)
     assert min(counts.values()) == 15
-    assert graph.weak
+    assert graph.unscored
     assert len(graph.verified) == 190
 
 
@@ -332,9 +332,9 @@ def test_a_pair_scores_models_that_is_among_the_strongest_of_one_of_its_images()
     matches = np.zeros((20, 2), np.int64)
     geometry = pycolmap.TwoViewGeometry()
     star = [VerifiedPair((1, leaf), matches, geometry) for leaf in range(2, 22)]
-    strong, weak = _split_by_strength(star)
-    assert len(strong) == 20
-    assert not weak
+    scored, unscored = _split_by_strength(star)
+    assert len(scored) == 20
+    assert not unscored
 
 
 def test_pairs_of_fewer_than_fifteen_inliers_are_left_out(tmp_path: Path) -> None:

@@ -240,7 +240,7 @@ def test_uncertain_directions_take_as_much_as_they_miss_the_limit_of_right_poses
     assert at_one_place.gain < 0.1  # more matches do not help
     unclear = confidence(replace(GOOD, axis_turn_deg=6.0))
     assert unclear.probability == pytest.approx(at_one_place.probability)
-    assert unclear.reasons == (Doubt("axis_unclear", {"turn_deg": 6.0}),)
+    assert unclear.reasons == (Doubt("principal_point_open", {"turn_deg": 6.0}),)
     both = confidence(replace(GOOD, direction_sigma_deg=4.8, axis_turn_deg=3.6))
     assert both.probability == pytest.approx(at_one_place.probability)
     far_off = confidence(replace(GOOD, direction_sigma_deg=60.0))
@@ -300,7 +300,7 @@ def test_a_cut_pair_casts_doubt_on_the_smaller_of_two_components(
     )
     assert few.probability < DOUBTFUL < alone.probability - 0.3
     edge = {"num_inliers": 29, "pair": f"{names[1]} - {names[4]}"}
-    assert Doubt("bridge_edge", edge) in few.reasons
+    assert Doubt("tied_by_one_pair", edge) in few.reasons
     assert few.gain > 0.5
 
 

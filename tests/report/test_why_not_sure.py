@@ -11,7 +11,7 @@ NAMES = ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
 
 def turned(degrees: float) -> Doubt:
     """Return a doubt that has a number of its own for each photograph."""
-    return Doubt("axis_unclear", {"turn_deg": degrees})
+    return Doubt("principal_point_open", {"turn_deg": degrees})
 
 
 def test_a_reason_is_told_once_with_the_range_of_its_numbers() -> None:

@@ -24,7 +24,7 @@ from colmap_affrect.stages.match import num_consistent
 LIKELY = 0.25
 
 
-class SetState:
+class ImageSet:
     """Reads what is known of a set.
 
     Attributes:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_affrect.escalation import set_state
+from colmap_affrect.escalation import image_set
 from colmap_affrect.escalation.escalate import Trial
 from colmap_affrect.escalation.expected_gain import (
     Candidate,
@@ -19,7 +19,7 @@ from colmap_affrect.escalation.expected_gain import (
     StepPlanner,
     _Selection,
 )
-from colmap_affrect.escalation.set_state import SetState, _megapixels
+from colmap_affrect.escalation.image_set import ImageSet, _megapixels
 from colmap_affrect.mappers.wrong_models import (
     StoodOn,
     ThrownAway,
@@ -33,7 +33,7 @@ from colmap_affrect.recipes import EscalateOptions, load_recipe
 NAMES = ["doubtful.jpg", "likely.jpg", "missing.jpg", "out.jpg", "sure.jpg"]
 
 
-def state_of(names: list[str], left_out: tuple[str, ...]) -> SetState:
+def state_of(names: list[str], left_out: tuple[str, ...]) -> ImageSet:
     """Return the state of a set that is mapped, of which nothing else is known."""
     context: Any = SimpleNamespace(
         listed_pairs=list,
@@ -43,7 +43,7 @@ def state_of(names: list[str], left_out: tuple[str, ...]) -> SetState:
         workspace=SimpleNamespace(model_inputs=lambda: "these"),
         current_model_inputs=lambda: "these",
     )
-    return SetState(context, EscalateOptions())
+    return ImageSet(context, EscalateOptions())
 
 
 def test_an_image_that_is_likely_right_weighs_a_quarter_of_what_it_may_gain() -> None:
@@ -101,7 +101,7 @@ def test_matches_are_looked_at_again_where_they_are_others(
         looked_at.append(len(indices))
         return 10 * len(indices)
 
-    monkeypatch.setattr(set_state, "num_consistent", num_consistent)
+    monkeypatch.setattr(image_set, "num_consistent", num_consistent)
     assert state._num_consistent([("a", "b")]) == {("a", "b"): 40}
     assert state._num_consistent([("a", "b")]) == {("a", "b"): 40}
     matches = np.zeros((7, 2), np.uint32)
