@@ -104,7 +104,7 @@ def escalation_of(context: Context) -> Escalation:
 
 
 def levels(context: Context) -> set[int]:
-    return set(context.matches.levels(escalation_of(context).state.pairs).values())
+    return set(context.matches.levels(escalation_of(context).image_set.pairs).values())
 
 
 def with_models(
@@ -136,11 +136,11 @@ def with_models(
 
 
 def test_learned_matches_are_kept_beside_those_that_are_there(context: Context) -> None:
-    pairs = escalation_of(context).state.pairs
+    pairs = escalation_of(context).image_set.pairs
     learned = context.matches.learned(list(pairs))
     assert levels(context) == {0}
     assert set(learned) == set(pairs)
-    states = escalation_of(context).state.states()
+    states = escalation_of(context).image_set.states()
     for pair, kept in learned.items():
         assert kept.matches.level == 1
         assert kept.matches.names == pair
@@ -379,7 +379,7 @@ def test_models_of_other_pairs_than_the_verified_ones_are_not_kept(
     mapped: Workspace, tmp_path: Path
 ) -> None:
     context = Context(copy_of(mapped, tmp_path / "out"))
-    without_matches(escalation_of(context), escalation_of(context).state.pairs[0])
+    without_matches(escalation_of(context), escalation_of(context).image_set.pairs[0])
     keep_best(context)
     assert not context.workspace.best.exists()
 
@@ -406,7 +406,7 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     )
     with_models(monkeypatch, found=sure, there=[UNSURE])
     said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
-    assert NAMES[0] not in escalation_of(said).state.weights([UNSURE])
+    assert NAMES[0] not in escalation_of(said).image_set.weights([UNSURE])
     map_learned_matches(escalation_of(said), mapper)
     learned_models = learned_models_on_record(said)
     assert learned_models
@@ -439,7 +439,7 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
     context: Context,
 ) -> None:
-    pairs = list(escalation_of(context).state.pairs)
+    pairs = list(escalation_of(context).image_set.pairs)
     context.matches.update_state(learned_models=LearnedModels("set", 1.0, True, 0.5))
     context.matches.remove(pairs=pairs[:1])
     assert not context.matches.has(pairs).any()
@@ -466,7 +466,7 @@ def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
     context = Context(workspace)
     with workspace.locked():
         reports = map_and_rematch.map_and_rematch(context, mapper, recipe)
-        assert reports[-1].num_done == len(escalation_of(context).state.pairs)
+        assert reports[-1].num_done == len(escalation_of(context).image_set.pairs)
         learned_models = learned_models_on_record(context)
         assert learned_models
         assert learned_models.score > 1.0

@@ -238,7 +238,7 @@ def test_strong_pairs_without_a_track_of_three_escalate(
     chain = {EASY: 200, (NAMES[1], NAMES[2]): 150}
     matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
-    monkeypatch.setattr(work.state, "num_inliers", lambda: chain)
+    monkeypatch.setattr(work.image_set, "num_inliers", lambda: chain)
     monkeypatch.setattr(Context, "verified_inliers", lambda _: apart)
     assert work.next_step() is None
     monkeypatch.setattr(Context, "verified_inliers", lambda _: matches)
@@ -254,7 +254,11 @@ def test_photographs_that_are_likely_right_in_another_model_need_a_quarter(
     inputs = work.context.current_model_inputs()
     monkeypatch.setattr(Workspace, "model_inputs", lambda _: inputs)
     models = [ModelSummary(names, 9, 2.0, 0.5) for names in ((), EASY)]
-    assert work.state.weights(models) == {EASY[0]: 0.25, EASY[1]: 0.25, NAMES[2]: 1.0}
+    assert work.image_set.weights(models) == {
+        EASY[0]: 0.25,
+        EASY[1]: 0.25,
+        NAMES[2]: 1.0,
+    }
 
 
 def test_each_step_has_a_bar_that_ends_full(before: Workspace, tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def escalation_of(context: Context) -> Escalation:
 
 def without_matches(context: Context, name: str) -> list[tuple[str, str]]:
     """Take the matches of an image, and return its pairs."""
-    own = [pair for pair in escalation_of(context).state.pairs if name in pair]
+    own = [pair for pair in escalation_of(context).image_set.pairs if name in pair]
     for found in list(context.matches.read(own)):
         none = replace(found, indices=found.indices[:0], scores=found.scores[:0])
         context.matches.write([none], own, 0)
@@ -75,7 +75,7 @@ def test_images_that_measured_frames_hold_need_no_others(context: Context) -> No
     own = without_matches(context, NAMES[3])
     names = tuple(sorted(NAMES))
     escalation = escalation_of(context)
-    states = escalation_of(context).state.states()
+    states = escalation_of(context).image_set.states()
     model = ModelSummary(
         names, 9, 2.0, 0.5, doubtful={NAMES[0]: (Doubt("few_matches"),)}
     )
