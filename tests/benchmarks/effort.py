@@ -140,8 +140,10 @@ def curve(
 def spent(context: Context) -> Row:
     """Return what escalation has taken so far, in nominal seconds, and what it was."""
     escalation = Escalation(context, Recipe().escalate)
-    models = escalation.state.models()
-    situation = escalation.state.situation(escalation.state.weights(models), models)
+    models = escalation.image_set.models()
+    situation = escalation.image_set.situation(
+        escalation.image_set.weights(models), models
+    )
     names = [level.name for level in situation.levels]
     learned_models = context.matches.state.learned_models
     return {

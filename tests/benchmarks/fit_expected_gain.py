@@ -127,7 +127,7 @@ def outcomes(images: Sequence[Path], truth: Truth, work_path: Path) -> list[Row]
         verify_matches(context)
         context.workspace.record_options("escalate", EscalateOptions().to_mapping())
         escalation = Escalation(context, EscalateOptions())
-        states = escalation.state.states()
+        states = escalation.image_set.states()
         features = context.features
         weak = [pair for pair, state in states.items() if state.num_inliers < STRONG]
         chosen = sorted(random.Random(0).sample(weak, min(NUM_PAIRS, len(weak))))

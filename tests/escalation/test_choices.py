@@ -163,7 +163,7 @@ def test_learned_matches_are_chosen_of_pairs_that_use_others_with_the_worth_of_m
     for first, second in states:
         learned[first, second] = Learned(matches_of(first, second, 2), (50, 0))
     escalation: Any = SimpleNamespace(
-        state=SimpleNamespace(
+        image_set=SimpleNamespace(
             states=lambda: states, is_measured=[True, True, False, False]
         ),
         matches=SimpleNamespace(learned=lambda _: learned),
