@@ -42,6 +42,8 @@ SHIFTED_SHARE = 0.2  # of the photographs of which nothing is known (judged)
 NO_SHARE = 1e-9  # of measurements that are false; numeric
 # Of the logarithm of a focal length of which nothing is expected; theory
 WIDE_SIGMA = 1.0
+# Of that of usual lenses, below which lines say nothing: so much is lost by their grid; numeric
+NO_PRECISION = 0.05
 MIN_FOCAL_PX = 1e-9  # whose logarithm is taken, or which is divided by; numeric
 SAME_PX = 1e-3  # to which two principal points are the same; numeric
 # By which EXIF and lines may differ before they contradict each other; theory
@@ -203,7 +205,7 @@ def measurement_of_lines(camera: LineCamera) -> Measurement | None:
     """
     usual_precision = line_model.USUAL_FOCAL_SIGMA**-2
     precision = camera.focal_sigma**-2 - usual_precision
-    if precision <= 0.0:
+    if precision <= NO_PRECISION * usual_precision:
         return None
     weighted = math.log(camera.focal) * camera.focal_sigma**-2
     weighted -= math.log(line_model.USUAL_FOCAL) * usual_precision

@@ -79,6 +79,9 @@ def test_one_of_three_measurements_that_is_far_from_the_others_hardly_counts() -
 def test_what_is_usual_is_divided_out_of_what_lines_say() -> None:
     nothing = by_lines(lines.USUAL_FOCAL, lines.USUAL_FOCAL_SIGMA)
     assert measurement_of_lines(nothing) is None
+    for hardly_anything in (0.49999, 0.495):
+        assert measurement_of_lines(by_lines(1.5, hardly_anything)) is None
+    assert measurement_of_lines(by_lines(1.5, 0.48)) is not None
     sharp = measurement_of_lines(by_lines(0.9, 0.06))
     assert sharp
     assert sharp.focal.focal == pytest.approx(0.9, rel=0.01)
