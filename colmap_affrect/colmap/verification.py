@@ -168,7 +168,7 @@ def _significant_geometry(
         return geometry
     if len(geometry.inlier_matches) >= MAX_FEW_INLIERS:
         return geometry
-    # The same samples, and others after them
+    # With a seed: the same samples, and others after them
     search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
     return _searched_geometry(cameras, keypoints, options, search) or geometry
 

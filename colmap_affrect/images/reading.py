@@ -288,7 +288,7 @@ GRAY_AS_STORED = (
     cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 )
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-# A part of the size, which is fast of JPEG: as large as it may be, largest divisor first
+# JPEG is decoded at an eighth, a quarter or half of its size, the smallest that is large enough
 PARTS_OF_COLOR = {
     8: cv2.IMREAD_REDUCED_COLOR_8,
     4: cv2.IMREAD_REDUCED_COLOR_4,

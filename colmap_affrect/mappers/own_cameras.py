@@ -25,7 +25,7 @@ class OwnCameras:
     other: OtherCameras | None
     """What stays open where they score no higher; None: not looked at."""
     trial: pycolmap.Reconstruction
-    """The model with them and some of the tracks at least."""
+    """The model with them, from some of the tracks; or ``whole``."""
 
 
 def own_cameras(

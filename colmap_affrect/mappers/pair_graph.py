@@ -120,7 +120,7 @@ class PairGraph:
     cameras: CameraById  # as in the database
     keypoints: Mapping[int, Singles]  # (N, 2) px by image id, of the images of pairs
     pairs: Pairs  # sorted by ids
-    unscored: Pairs  # that are not among the strongest, and in the cache only
+    unscored: Pairs  # not among the strongest: points are made of them as well
     min_num_matches: int  # pairs with fewer inliers are left out
     raw_matches: dict[Ids, Indices] = field(default_factory=dict)
     """Raw (M, 2) matches of the strongest pairs, where a database was read."""

@@ -6,7 +6,7 @@ See :mod:`colmap_affrect.mappers.reliability`.
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -50,6 +50,10 @@ from colmap_affrect.mappers.tie_points import (
     tie_points_of,
 )
 
+# Of pairs, by their graph: models are scored many times
+KNOWN_ROTATION_RATIOS: WeakKeyDictionary[PairGraph, dict[Ids, float]] = (
+    WeakKeyDictionary()
+)
 # The terms of the regression are fitted to features that are measured with these numbers, which
 # are judged on the benchmark scenes; after a change fit again.
 MIN_TOLD = 0.03
@@ -251,7 +255,7 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
         for pair in _strongest_to_frames(context, pairs):
             strongest[pair.ids] = pair
     found = {}
-    known = _known_rotation_ratios(context.graph)
+    known = KNOWN_ROTATION_RATIOS.setdefault(context.graph, {})
     step = sampling_step(len(strongest), MAX_ROTATION_PAIRS)
     for pair in list(strongest.values())[::step]:
         if pair.ids not in known:
@@ -260,14 +264,8 @@ def _rotation_ratios(context: _ModelContext) -> dict[Ids, float]:
     return found
 
 
-@lru_cache(maxsize=1)
-def _known_rotation_ratios(_: PairGraph) -> dict[Ids, float]:
-    """Return the ratios of pairs of a graph so far, to add to: models are scored many times."""
-    return {}
-
-
 def _rotation_ratio(graph: PairGraph, pair: VerifiedPair) -> float:
-    """Return the share of matches that a rotation explains, which hangs on no model."""
+    """Return the share of matches that a rotation explains, which no model changes."""
     sizes = graph.sizes(pair.ids)
     max_error_px = MAX_ERROR * max(map(max, sizes))
     points1, points2 = graph.points(pair)

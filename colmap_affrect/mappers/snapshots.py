@@ -19,8 +19,8 @@ SNAPSHOT_FRAMES = 100
 """Images between two snapshots. A model of so many images is kept whatever comes after it, so that
 mapping can go on from a snapshot of it; resource."""
 MAX_SNAPSHOTS = 10
-"""Of one mapping: writing one takes time in proportion to the images that there are. What a kill
-loses is a tenth of a mapping at most; resource."""
+"""Of one mapping: writing one takes time in proportion to the images that there are. A kill
+loses what came after the last complete one; resource."""
 # A snapshot may be incomplete when a run is killed; the one before is complete; theory
 NUM_KEPT = 2
 

@@ -25,8 +25,9 @@ SOME_TRACKS = "from some of the tracks"  # what made a model, in the words of a 
 
 GROWTH_OF_LARGE = 1.4
 """Of images or points from one adjustment of all to the next. Each takes time in proportion to its
-images, so all together take ``r / (r - 1)`` times as much as the last one: 3.5 times, with COLMAP's
-1.1 eleven times (resource). In between local adjustments keep poses where their neighbours are."""
+images, so all together take ``r / (r - 1)`` times as much as the last one: that is 3.5 times, and
+eleven times with COLMAP's 1.1 (resource). In between, local adjustments keep poses where their
+neighbours are."""
 NEVER = 2**31 - 1  # images or points, of which so many never come; numeric
 SELDOM: Mapping[str, Plain] = {
     "ba_global_frames_ratio": GROWTH_OF_LARGE,
@@ -36,7 +37,7 @@ SELDOM: Mapping[str, Plain] = {
     "ba_global_points_freq": NEVER,
     # The next images adjust the same neighbours once more
     "ba_local_max_refinements": 1,
-    # All are adjusted once more with all tracks, which changes the last digits of poses most
+    # Where tracks were left out, all are adjusted once more with all of them
     "ba_local_function_tolerance": FAST_TOLERANCE,
     "ba_global_function_tolerance": FAST_TOLERANCE,
 }

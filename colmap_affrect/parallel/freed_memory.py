@@ -11,8 +11,8 @@ ARENA_MAX = -8  # format
 # Arrays up to this size, of a photograph or a layer of a network, are taken from memory that was
 # freed before; resource
 MAX_ARRAY_BYTES = 1 << 30
-# Freed memory that is kept; ALIKED frees 1.1 GB of a megapixel, and a network wants it again for
-# the next photograph; resource
+# Freed memory that is kept above all that is in use; ALIKED frees 1.1 GB of a megapixel, and a
+# network wants it again for the next photograph; resource
 KEPT_BYTES = (1 << 31) - 1
 
 
@@ -20,14 +20,15 @@ def keep_freed_memory() -> None:
     """Let this process use freed memory again, instead of giving large arrays back at once.
 
     The system zeroes each page that it gives, one thread at a time: of the time of ALIKED in two
-    threads that was three quarters. Arenas of threads hold no large arrays, so there is but one.
+    threads that was three quarters. Arenas of threads hold no blocks above 64 MB, so all threads
+    share the main one. Nothing changes where the library refuses such large blocks (before 2.35).
     """
     if sys.platform == "linux":
         with suppress(AttributeError):  # another C library than GNU's
             change = ctypes.CDLL(None).mallopt
-            change(MMAP_THRESHOLD, MAX_ARRAY_BYTES)
-            change(TRIM_THRESHOLD, KEPT_BYTES)
-            change(ARENA_MAX, 1)
+            if change(MMAP_THRESHOLD, MAX_ARRAY_BYTES):
+                change(TRIM_THRESHOLD, KEPT_BYTES)
+                change(ARENA_MAX, 1)
 
 
 def return_freed_memory() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.errors import damage
 from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.project.regular_files import read_regular
 
@@ -109,7 +110,9 @@ class ModelReader:
         """
         if number not in self._observations:
             model = self.model(number)
-            keypoints = _read_keypoints(self.path(number) / "images.bin")
+            path = self.path(number) / "images.bin"
+            with damage(path, "run 'colmap-affrect map' again"):
+                keypoints = _read_keypoints(path)
             self._observations[number] = _observations_of(model, keypoints)
         return self._observations[number]
 

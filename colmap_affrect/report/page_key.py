@@ -20,13 +20,18 @@ HEAD_BYTES = 4096  # of a page, in which its key is; format
 
 
 def page_key(
-    workspace: Workspace, report: RunReport, marks: Marks, commands: Sequence[str]
+    workspace: Workspace,
+    report: RunReport,
+    names: Sequence[str],
+    marks: Marks,
+    commands: Sequence[str],
 ) -> str:
     """Return a digest of all that a page is made from.
 
     Args:
         workspace: of the run, whose pairs and models are shown.
-        report: of the run; how long its stages took does not count.
+        report: of the run; how much its stages did, and how long that took, does not count.
+        names: of all photographs.
         marks: tie points by hand.
         commands: that the page offers.
 
@@ -36,7 +41,11 @@ def page_key(
     if workspace.is_foreign or workspace.is_changed:
         return ""
     content = report.to_mapping()
-    del content["stages"]
+    said = []
+    for stage in content.pop("stages"):
+        said.append([stage["name"], stage["failed"], stage["warned"]])
+    folder = workspace.photographs()
+    photographs = [folder / name for name in names] if folder else []
     folders = [workspace.sparse / str(number) for number in range(len(report.models))]
     places = {}
     for point, of_images in marks.items():
@@ -45,6 +54,8 @@ def page_key(
     return digest_of(
         [
             content,
+            said,
+            stamp_of(photographs),
             [kept_digests(folder) for folder in folders],
             stamp_of(stores),
             workspace.record(),

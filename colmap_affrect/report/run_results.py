@@ -66,7 +66,7 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     models = ModelReader(workspace.sparse)
     report = _report(context, result, models, num_inliers=pair_inliers)
     commands = command_with_tie_points(context), command_with_masks(context)
-    key = page_key(workspace, report, result.marks, commands)
+    key = page_key(workspace, report, result.names, result.marks, commands)
     keeps_page = page and is_current(workspace, key)
     if not keeps_page:
         workspace.remove_page()  # a kill leaves none beside another report

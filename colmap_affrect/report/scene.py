@@ -139,6 +139,10 @@ def read_view_with_tracks(
         return _no_view(error)
     model = pycolmap.Reconstruction(reader.model(number))
     _turn_upright(model, reader.path(number))
+    cameras = model.cameras.values()
+    has_axes = all(len(camera.focal_length_idxs()) for camera in cameras)
+    if not has_axes:  # of panoramas, which nobody can look through
+        return replace(view_of(model), kinds=kinds)
     return replace(view_of(model, seen, max_num_observations), kinds=kinds)
 
 

@@ -111,6 +111,23 @@ def with_exif(
     return camera_prior(camera(), exif, said)
 
 
+@pytest.mark.parametrize(
+    ("exif", "lines"),
+    [(12.0, 1.6), (4.0, 1.2), (3.0, 1.2), (0.5, 1.2), (0.45, 1.5)],
+)
+def test_vague_lines_that_are_far_from_exif_leave_it_as_it_is(
+    exif: float, lines: float
+) -> None:
+    """Also where EXIF is of a lens that is not usual."""
+    record = replace(NOTHING, source="exif")
+    said = [with_usual(lines, 0.2)]
+    native = camera()
+    native.params = [1000.0 * exif, *native.params[1:]]
+    prior = camera_prior(native, record, said)
+    assert prior.focal_px == pytest.approx(1000.0 * exif, rel=0.005)
+    assert prior.sigma == pytest.approx(EXIF_SIGMA, rel=0.02)
+
+
 @pytest.mark.parametrize("source", ["exif", "exif-rescaled"])
 @pytest.mark.parametrize(("difference", "sigma"), [
     (0.0, 0.1), (0.1, 0.1), (-0.12, 0.12), (0.08, 0.2),
