@@ -98,12 +98,12 @@ def escalation_summary(context: Context) -> EscalationSummary:
     if workspace.is_foreign or "escalate" not in workspace.started_stages:
         return EscalationSummary()
     escalation = Escalation(context, context.escalation)
-    state = escalation.image_set
-    models = state.models()
-    weights = state.weights(models)
+    image_set = escalation.image_set
+    models = image_set.models()
+    weights = image_set.weights(models)
     if not (weights or escalation.has_begun):  # large sets take long to go through
         return EscalationSummary()
-    situation = state.situation(weights, models)
+    situation = image_set.situation(weights, models)
     effort = escalation.matches.state.effort or context.effort
     return EscalationSummary(
         effort=effort,

@@ -25,10 +25,7 @@ from colmap_affrect.mappers.model_score import ModelScorer
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of, has_rigs
 from colmap_affrect.mappers.rigs import certain_models_of_rigs
 from colmap_affrect.mappers.search import Search
-from colmap_affrect.mappers.some_tracks import (
-    adjust_seldom,
-    large_models,
-)
+from colmap_affrect.mappers.some_tracks import adjust_seldom, large_models
 from colmap_affrect.mappers.thinning import OF_LARGE_SETS
 from colmap_affrect.mappers.tie_points import tie_points_of
 from colmap_affrect.options import within

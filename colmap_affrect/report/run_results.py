@@ -73,7 +73,9 @@ def write_results(context: Context, result: MappingResult, *, page: bool) -> Run
     replace_text(workspace.report, report.to_json())
     if page and not keeps_page:
         content = _page_content(context, result, report, models, pair_inliers)
-        content = replace(content, key=key)
+        content = replace(
+            content, key=key, marks_command=commands[0], masks_command=commands[1]
+        )
         write_run_page(workspace, report, content, context.progress)
     if not workspace.is_foreign:
         context.features.keep_summaries()
@@ -152,7 +154,7 @@ def _page_content(
     models: ModelReader,
     num_inliers: Mapping[Pair, int],
 ) -> RunContent:
-    """Return what ``report.html`` has beside the report.
+    """Return what ``report.html`` has beside the report and commands.
 
     Args:
         context: of the workspace, with its models.
@@ -174,8 +176,6 @@ def _page_content(
         pair_files=lines.write_files(workspace),
         num_pairs_left_out=lines.num_left_out,
         cameras=context.graph.cameras,
-        marks_command=command_with_tie_points(context),
-        masks_command=command_with_masks(context),
         reader=models,
     )
 
