@@ -38,15 +38,31 @@ def run_cancellable(
         finally:
             ended.set()
 
-    threading.Thread(target=work, daemon=True).start()
     try:
+        # In here, as Ctrl-C may come when it has just begun.
+        threading.Thread(target=work, daemon=True).start()
         while not ended.wait(POLL_S):
             pass
     except KeyboardInterrupt:
         known.cancel()
-        ended.wait(LEAVE_AFTER_S)
+        if not ended.wait(LEAVE_AFTER_S):
+            _silence_until(ended)
         raise
     return outcome.result()
+
+
+def _silence_until(ended: threading.Event) -> None:
+    """Keep COLMAP's lines from following the last one of a command that left it behind."""
+    level = pycolmap.logging.minloglevel
+    if level == pycolmap.logging.FATAL.value:  # for another call that was left
+        return
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+
+    def restore() -> None:
+        ended.wait()
+        pycolmap.logging.minloglevel = level
+
+    threading.Thread(target=restore, daemon=True).start()
 
 
 def run_mapping(
