@@ -7,7 +7,8 @@ moves is the same surface again and again.
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
     strongest_of_images,
 )
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 NUM_PAIRS = 6  # the strongest of each image that are looked at; resource
 MAX_NUM_PAIRS = 300  # of a model that are looked at, the strongest; resource
@@ -75,6 +77,10 @@ class _Motions:
             counts.append([is_own.sum(), is_other.sum()])
         return np.asarray(np.mean(counts, axis=0))
 
+    def is_large(self) -> bool:
+        """Tell whether more moves in another way than lenses and poses that are a little off."""
+        return bool(self.cells()[1] >= MIN_CELLS)
+
     def is_chained(self, num_pairs: Features) -> bool:
         """Tell whether what moves in another way does so in other pairs, too."""
         first, second = self.pair.ids
@@ -107,30 +113,38 @@ def share_moving_as_modelled(model: pycolmap.Reconstruction, graph: PairGraph) -
             contradicting.append(at_most)
     if len(contradicting) < least:
         return 1.0  # whatever moves in them
-    showing = _showing_another_motion(contradicting)
+    showing = _showing_another_motion(contradicting, least)
     if len(showing) < least:
         return 1.0
     num_cells = np.sum([motions.cells() for motions in showing], axis=0)
     return float(num_cells[0] / max(num_cells.sum(), 1.0))
 
 
-def _showing_another_motion(contradicting: Collection[_Motions]) -> list[_Motions]:
+def _showing_another_motion(
+    contradicting: Sequence[_Motions], least: float
+) -> list[_Motions]:
     """Return what moves in the pairs in which enough moves as one, and in other pairs, too.
 
     Args:
         contradicting: All matches of pairs that contradict a model.
+        least: The fewest of these pairs that matter; none are returned once it is out of reach.
     """
     found = list[_Motions]()
-    for at_most in contradicting:
-        motions = _moving_as_one(at_most)
-        if motions:
-            found.append(motions)
+    num_large = 0
+    searched = map_ordered(_moving_as_one, contradicting, available_cores())
+    with closing(searched) as results:
+        for num_searched, motions in enumerate(results, start=1):
+            if motions:
+                found.append(motions)
+                num_large += motions.is_large()
+            if num_large + len(contradicting) - num_searched < least:
+                return []
     num_pairs = _num_pairs_of_features(found)
-    showing = list[_Motions]()
-    for motions in found:
-        if motions.cells()[1] >= MIN_CELLS and motions.is_chained(num_pairs):
-            showing.append(motions)
-    return showing
+    return [
+        motions
+        for motions in found
+        if motions.is_large() and motions.is_chained(num_pairs)
+    ]
 
 
 def _num_pairs_of_features(found: Collection[_Motions]) -> Features:
@@ -180,7 +194,7 @@ def _contradicting(
         own=matches[agrees],
         other=far,
     )
-    if at_most.cells()[1] < MIN_CELLS:
+    if not at_most.is_large():
         return None
     matched = keypoints1[far[:, 0]], keypoints2[far[:, 1]]
     num_consistent = num_consistent_keypoints(matched)

@@ -31,6 +31,7 @@ from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.other_motions import (
     _contradicting,
     _Motions,
+    _showing_another_motion,
     share_moving_as_modelled,
 )
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
@@ -239,12 +240,13 @@ def test_matches_contradict_a_model_that_are_half_as_far_again_as_those_that_agr
         assert found.own[:, 0].tolist() == list(range(60, 120))
 
 
-@pytest.mark.parametrize(("num_contradicting", "num_verified"), [(1, 0), (2, 2)])
+@pytest.mark.parametrize(("num_contradicting", "is_verified"), [(1, False), (2, True)])
 def test_nothing_is_verified_where_too_few_pairs_contradict_a_model(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     num_contradicting: int,
-    num_verified: int,
+    *,
+    is_verified: bool,
 ) -> None:
     verified = []
 
@@ -261,7 +263,25 @@ def test_nothing_is_verified_where_too_few_pairs_contradict_a_model(
     monkeypatch.setattr(other_motions, "_contradicting", contradicting)
     monkeypatch.setattr(other_motions, "estimate_geometry", estimate)
     assert share(tmp_path / "still.db", -np.inf) == 1.0
-    assert len(verified) == num_verified
+    assert bool(verified) == is_verified
+
+
+def test_pairs_are_not_searched_any_more_when_too_few_can_show_another_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched = []
+
+    def estimate(*_: Any) -> pycolmap.TwoViewGeometry:
+        searched.append(1)
+        return NOTHING
+
+    monkeypatch.setattr(other_motions, "estimate_geometry", estimate)
+    monkeypatch.setattr(other_motions, "available_cores", lambda: 2)
+    side = Side(CAMERA, np.zeros((0, 2), np.float32))
+    pair = VerifiedPair((1, 2), NO_MATCHES, NOTHING)
+    contradicting = [_Motions(pair, (side, side), NO_MATCHES, NO_MATCHES)] * 100
+    assert _showing_another_motion(contradicting, least=95) == []
+    assert 6 <= len(searched) <= 6 + 4  # the others were begun before
 
 
 def test_a_cell_belongs_to_the_motion_with_more_matches_in_it() -> None:
