@@ -14,6 +14,7 @@ from synthetic import unit_rows
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.matchers import nearest
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.nearest import NearestNeighbors, NearestOptions
 
@@ -221,19 +222,43 @@ def matched_rows(
     return found.indices.tolist()
 
 
-def test_pair_with_nothing_in_common_is_matched_by_the_strongest_half_alone() -> None:
+@pytest.fixture
+def few_looked_at(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A tenth of the features of an image, by which a pair may be given up."""
+    num = NUM_SHAPED // 10
+    monkeypatch.setattr(nearest, "NUM_LOOKED_AT", num)
+    return num
+
+
+def test_pair_with_nothing_in_common_is_matched_by_the_largest_features_alone(
+    few_looked_at: int,
+) -> None:
     first = shaped_image(1)
     second = shaped_image(2)
     every = matched_rows(first, second, may_give_up=False)
     some = matched_rows(first, second, may_give_up=True)
-    responses = first.features.responses
-    assert 20 < len(some) < 0.7 * len(every)
-    weakest = min(responses[row] for row, _ in some)
-    assert NUM_SHAPED // 2 < weakest < 0.6 * NUM_SHAPED
-    assert some == [pair for pair in every if responses[pair[0]] > NUM_SHAPED // 2]
+    assert 5 < len(some) <= few_looked_at < len(every)
+    for image, rows in zip((first, second), np.transpose(some), strict=True):
+        areas = np.linalg.det(image.features.lafs[:, :, :2])
+        assert np.count_nonzero(areas > areas[rows].min()) < few_looked_at
+    alone = [largest_of(image, few_looked_at) for image in (first, second)]
+    of_largest = matched_rows(alone[0], alone[1], may_give_up=False)
+    assert len(some) == len(of_largest)
 
 
-def test_pair_whose_strongest_half_agrees_is_matched_as_a_whole() -> None:
+def largest_of(image: ImageFeatures, num: int) -> ImageFeatures:
+    """The image with its largest features alone."""
+    known = image.features
+    areas = np.linalg.det(known.lafs[:, :, :2])
+    rows = np.sort(np.argsort(-areas)[:num])
+    features = LocalFeatures(
+        known.lafs[rows], known.responses[rows], known.descriptors[rows]
+    )
+    return replace(image, features=features)
+
+
+@pytest.mark.usefixtures("few_looked_at")
+def test_pair_whose_largest_features_agree_is_matched_as_a_whole() -> None:
     first = shaped_image(1)
     second = shaped_image(2, related_to=first)
     every = matched_rows(first, second, may_give_up=False)
@@ -241,34 +266,38 @@ def test_pair_whose_strongest_half_agrees_is_matched_as_a_whole() -> None:
     assert matched_rows(first, second, may_give_up=True) == every
 
 
-def test_many_matches_have_something_in_common_however_they_lie() -> None:
+@pytest.mark.parametrize(("num_agreeing", "is_given_up"), [(1, True), (2, False)])
+def test_pair_is_given_up_where_less_than_two_matches_agree_with_their_neighbours(
+    monkeypatch: pytest.MonkeyPatch,
+    few_looked_at: int,
+    num_agreeing: int,
+    *,
+    is_given_up: bool,
+) -> None:
+    monkeypatch.setattr(nearest, "num_consistent_matches", lambda *_: num_agreeing)
     first = shaped_image(1)
     second = shaped_image(2, related_to=first)
-    scattered = second.features.lafs.copy()
-    scattered[:, :, 2] = shaped_image(3).features.lafs[:, :, 2]
-    second = replace(second, features=replace(second.features, lafs=scattered))
-    halved = len(matched_rows(first, second, may_give_up=True))
-    assert halved <= NUM_SHAPED // 2  # 200 matches that contradict each other
-    both = [with_features(image, times=2) for image in (first, second)]
-    assert len(matched_rows(both[0], both[1], may_give_up=True)) > 1.5 * NUM_SHAPED
+    found = matched_rows(first, second, may_give_up=True)
+    assert (len(found) <= few_looked_at) == is_given_up
 
 
-def with_features(image: ImageFeatures, times: int) -> ImageFeatures:
-    """The image beside copies of itself, whose descriptors differ."""
-    known = image.features
-    lafs = []
-    descriptors = []
-    for number in range(times):
-        shift = np.array([0.0, 0.0, 2000.0 * number])
-        lafs.append(known.lafs + shift)
-        descriptors.append(np.roll(known.descriptors, 5 * number, axis=1))
-    responses = np.tile(known.responses, times)
-    features = LocalFeatures(
-        np.concatenate(lafs), responses, np.concatenate(descriptors)
-    )
-    return replace(image, features=features)
+@pytest.mark.parametrize(("share", "is_looked_at"), [(2.5, False), (1.5, True)])
+def test_pair_is_looked_at_where_that_saves_three_quarters(
+    monkeypatch: pytest.MonkeyPatch, share: float, *, is_looked_at: bool
+) -> None:
+    monkeypatch.setattr(nearest, "NUM_LOOKED_AT", int(NUM_SHAPED * share / 4))
+    first = shaped_image(1)
+    second = shaped_image(2)
+    every = matched_rows(first, second, may_give_up=False)
+    some = matched_rows(first, second, may_give_up=True)
+    assert (len(some) < len(every)) == is_looked_at
 
 
+def test_pairs_are_looked_at_by_two_thousand_features() -> None:
+    assert 1000 < nearest.NUM_LOOKED_AT < 4000
+
+
+@pytest.mark.usefixtures("few_looked_at")
 def test_pair_whose_frames_tell_nothing_is_matched_as_a_whole() -> None:
     images = []
     for seed in (1, 2):
