@@ -11,8 +11,9 @@ from mapping_tasks import write_images
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.model_files import Poses
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.mappers.pair_graph import PairGraph
 
 WIDTH = 1000

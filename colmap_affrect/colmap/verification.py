@@ -1,16 +1,12 @@
-"""Geometric verification of raw matches by pycolmap, and its significance."""
+"""Geometric verification of the raw matches of a pair by pycolmap, and its significance."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import islice
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import (
     Cameras,
@@ -20,18 +16,13 @@ from colmap_affrect.colmap.two_views import (
     telling_shapes,
 )
 from colmap_affrect.geometry.affine import homography_errors
-from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.neighbors import num_consistent_matches
 from colmap_affrect.geometry.parallax import text_line_matches
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
-from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 
-Names = tuple[str, str]
-# (N, 2, 3) LAFs of each image of a pair, in pixel-centre px
-Frames = tuple[Floats, Floats]
 Matches = NDArray[np.integer]  # (M, 2), rows of the features of each image of a pair
 
-PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many; resource
 # Of the inliers on a line of writing; where more are, they made it; judged
 MAX_WRITTEN_SHARE = 0.15
 # Raw matches that agree with their neighbours, below which a pair shows nothing in common: 256
@@ -59,7 +50,6 @@ NEARLY_EXPLAINED = 10.0
 MAX_LEAST_SHARE = 0.5
 # Raw matches; with more, a pair is searched in any case; resource
 MAX_NUM_LOOKED_AT = 300
-NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 
 class VerificationOptions(PresetOptions):
@@ -167,13 +157,48 @@ def _significant_geometry(
 
     Its inliers are rows, twice. None where there are too few of them, or chance made them.
     """
-    search = _search_options(keypoints, options)
-    geometry = _searched_geometry(cameras, keypoints, options, search)
-    if geometry is None or not options.min_significance:
+    num_matches = len(keypoints[0])
+    least = max(options.min_num_inliers, options.min_inlier_ratio * num_matches)
+
+    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
+        of_chance = significance(found, cameras, keypoints, options.max_error_px)
+        return of_chance < options.min_significance
+
+    geometry = _searched_geometry(cameras, keypoints, options)
+    if geometry is None or len(geometry.inlier_matches) < least:
+        return None
+    if not options.min_significance:
         return geometry
-    if len(geometry.inlier_matches) >= MAX_FEW_INLIERS:
-        return geometry
-    return _searched_again(geometry, cameras, keypoints, options)
+    if is_chance(geometry):
+        points = (_positions(keypoints[0]), _positions(keypoints[1]))
+        geometry = _planar_geometry(geometry, points, options)
+        is_found = len(geometry.inlier_matches) >= least and not is_chance(geometry)
+        return geometry if is_found else None
+    if len(geometry.inlier_matches) < MAX_FEW_INLIERS:
+        found = _searched_again(geometry, cameras, keypoints, options)
+        if found and len(found.inlier_matches) >= least and not is_chance(found):
+            return found
+    return geometry
+
+
+def _searched_geometry(
+    cameras: Cameras,
+    keypoints: Keypoints,
+    options: VerificationOptions,
+    times_needed: float = TRIALS_PER_NEEDED_TRIAL,
+) -> pycolmap.TwoViewGeometry | None:
+    """Return what a search of matches finds, with rows as inliers; None where that is nothing."""
+    rows = _twice(np.arange(len(keypoints[0]), dtype=np.uint32))
+    geometry = pycolmap.estimate_two_view_geometry(
+        cameras[0],
+        _positions(keypoints[0]),
+        cameras[1],
+        _positions(keypoints[1]),
+        rows,
+        _search_options(keypoints, options, times_needed),
+    )
+    # Of a geometry that it rejects the estimator returns the inliers all the same.
+    return None if geometry.config in REJECTED else geometry
 
 
 def _searched_again(
@@ -181,72 +206,44 @@ def _searched_again(
     cameras: Cameras,
     keypoints: Keypoints,
     options: VerificationOptions,
-) -> pycolmap.TwoViewGeometry:
-    """Return the geometry of the matches that a geometry nearly explains.
+) -> pycolmap.TwoViewGeometry | None:
+    """Return the geometry of the matches that a geometry of few inliers nearly explains.
 
     Args:
-        geometry: of few inliers; it is returned where the search finds nothing.
+        geometry: what a search of all matches has found.
         cameras: of the two images.
-        keypoints: of the matches.
+        keypoints: of all matches.
         options: of verification.
     """
     with np.errstate(all="ignore"):  # of points that a camera cannot undistort
         model = pair_model(geometry, cameras, keypoints)
         if model is None:
-            return geometry
+            return None
         every = np.arange(len(keypoints[0]))
         errors = model.errors(every, every)
     rows = np.flatnonzero(errors <= NEARLY_EXPLAINED * options.max_error_px)
     nearly_explained = (keypoints[0][rows], keypoints[1][rows])
-    search = _search_options(nearly_explained, options)
-    search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
-    found = _searched_geometry(cameras, nearly_explained, options, search)
-    if found is None:
-        return geometry
-    inliers = rows[np.asarray(found.inlier_matches, np.int64)[:, 0]]
-    found.inlier_matches = _twice(inliers.astype(np.uint32))
+    found = _searched_geometry(
+        cameras, nearly_explained, options, TRIALS_OF_FEW_INLIERS
+    )
+    if found is not None:
+        inliers = rows[np.asarray(found.inlier_matches, np.int64)[:, 0]]
+        found.inlier_matches = _twice(inliers.astype(np.uint32))
     return found
 
 
-def _searched_geometry(
-    cameras: Cameras,
-    keypoints: Keypoints,
-    options: VerificationOptions,
-    search: pycolmap.TwoViewGeometryOptions,
-) -> pycolmap.TwoViewGeometry | None:
-    """Return what one search finds, as :func:`_significant_geometry` does."""
-    num_matches = len(keypoints[0])
-    rows = _twice(np.arange(num_matches, dtype=np.uint32))
-    points = (_positions(keypoints[0]), _positions(keypoints[1]))
-    geometry = pycolmap.estimate_two_view_geometry(
-        cameras[0], points[0], cameras[1], points[1], rows, search
-    )
-    min_num_inliers = max(
-        options.min_num_inliers, options.min_inlier_ratio * num_matches
-    )
-    # Of a geometry that it rejects the estimator returns the inliers all the same.
-    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
-        return None
-
-    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
-        of_chance = significance(found, cameras, keypoints, options.max_error_px)
-        return of_chance < options.min_significance
-
-    if not options.min_significance or not is_chance(geometry):
-        return geometry
-    planar = _planar_geometry(geometry, points, options)
-    if len(planar.inlier_matches) < min_num_inliers or is_chance(planar):
-        return None
-    return planar
-
-
 def _search_options(
-    keypoints: Keypoints, options: VerificationOptions
+    keypoints: Keypoints, options: VerificationOptions, times_needed: float
 ) -> pycolmap.TwoViewGeometryOptions:
     """Return pycolmap's options for a pair, so that the search ends when it is sure enough.
 
     COLMAP draws several times as many samples as its confidence asks for, and those of few
     matches for a smaller share of inliers than any pair is verified with.
+
+    Args:
+        keypoints: of the matches.
+        options: of verification.
+        times_needed: how many times as many samples are drawn as the confidence asks for.
     """
     num_matches = len(keypoints[0])
     search = two_view_options(_without_vain_trials(keypoints, options))
@@ -255,7 +252,7 @@ def _search_options(
         search.ransac.min_inlier_ratio = max(
             search.ransac.min_inlier_ratio, least_share
         )
-        search.ransac.dyn_num_trials_multiplier = TRIALS_PER_NEEDED_TRIAL
+        search.ransac.dyn_num_trials_multiplier = times_needed
     return search
 
 
@@ -354,232 +351,3 @@ def max_error_px(
         return options.max_error_px
     scales = [max(camera.width, camera.height) / extracted_px for camera in cameras]
     return options.max_error_px * float(np.mean(np.maximum(scales, 1.0)))
-
-
-ExtractedPx = int | Mapping[tuple[int, int], int] | None
-"""Longest side that photographs were shrunk to, if any; or by pair of image ids, lower first."""
-
-
-def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
-    """Return what was true of a pair of image ids."""
-    return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
-
-
-@dataclass(frozen=True)
-class _Task:
-    """A pair to verify, with the keypoints of its matches alone: it may go to another machine."""
-
-    image_ids: tuple[int, int]
-    sides: tuple[Side, Side]  # keypoints of a row match
-    matches: Matches  # raw, numbers of the keypoints in the database
-    extracted_px: int | None
-
-    @classmethod
-    def of(
-        cls,
-        image_ids: tuple[int, int],
-        sides: tuple[Side, Side],
-        matches: Matches,
-        extracted_px: int | None,
-    ) -> Self:
-        """Keep of two images the keypoints that are matched.
-
-        Args:
-            image_ids: of the two images.
-            sides: with all of their keypoints.
-            matches: (M, 2) numbers of keypoints.
-            extracted_px: longest side that photographs were shrunk to before extraction, if any.
-        """
-        matched1 = Side(sides[0].camera, sides[0].keypoints[matches[:, 0]])
-        matched2 = Side(sides[1].camera, sides[1].keypoints[matches[:, 1]])
-        return cls(image_ids, (matched1, matched2), matches, extracted_px)
-
-
-@dataclass(frozen=True)
-class _Done:
-    """A pair that is verified, or rejected."""
-
-    image_ids: tuple[int, int]
-    geometry: pycolmap.TwoViewGeometry
-
-
-@dataclass(frozen=True)
-class _Estimator:
-    """Estimates the geometries of pairs, in a thread of this process or on a worker."""
-
-    options: VerificationOptions
-
-    def __call__(self, task: _Task) -> _Done:
-        """Return the geometry of a pair; its inliers are raw matches."""
-        rows = _twice(np.arange(len(task.matches), dtype=np.uint32))
-        geometry = estimate_geometry(task.sides, rows, self.options, task.extracted_px)
-        inliers = np.asarray(geometry.inlier_matches)[:, 0]
-        geometry.inlier_matches = task.matches.astype(np.uint32)[inliers]
-        return _Done(task.image_ids, geometry)
-
-
-def verify(
-    path: Path,
-    options: VerificationOptions,
-    extracted_px: ExtractedPx = None,
-    advance: Callable[[int], None] | None = None,
-    pairs: Collection[tuple[int, int]] | None = None,
-) -> None:
-    """Estimate the two-view geometry of every matched pair of a database that has none yet.
-
-    Args:
-        path: the database.
-        options: of verification.
-        extracted_px: longest side that photographs were shrunk to before extraction.
-        advance: is called with the number of pairs that are done.
-        pairs: of image ids, the lower one first, that may be verified; None: all.
-    """
-    with colmap_database.open_database(path) as database:
-        todo = colmap_database.pairs_to_verify(database)
-        if pairs is not None:
-            may_be_verified = [tuple(pair) in pairs for pair in todo.tolist()]
-            todo = todo[may_be_verified]
-        if len(todo):
-            colmap_database.require_database_space(path, len(todo))
-            verify_pairs(
-                database=database,
-                pairs=todo,
-                options=options,
-                extracted_px=extracted_px,
-                advance=advance,
-            )
-
-
-def verify_pairs(
-    database: pycolmap.Database,
-    pairs: Indices,
-    options: VerificationOptions,
-    extracted_px: ExtractedPx = None,
-    advance: Callable[[int], None] | None = None,
-    executor: Executor | None = None,
-) -> None:
-    """Estimate the two-view geometries of matched pairs.
-
-    A geometry is written when it has been judged: whatever ends this, no pair counts as verified
-    that was not.
-
-    Args:
-        database: has the keypoints and raw matches, and gets the geometries.
-        pairs: (N, 2) image ids.
-        options: of verification.
-        extracted_px: longest side that photographs were shrunk to before extraction.
-        advance: is called with the number of pairs that are done.
-        executor: where pairs are verified, e.g. a cluster; None: threads here.
-    """
-    executor = executor or Threads(available_cores())
-    cameras = colmap_database.cameras_of_images(database)
-
-    @lru_cache(NUM_CACHED_IMAGES)
-    def side(image_id: int) -> Side:
-        keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
-        return Side(cameras[image_id], keypoints)
-
-    def tasks() -> Iterator[_Task]:
-        for image_id1, image_id2 in pairs:
-            sides = (side(image_id1), side(image_id2))
-            matches = _each_once(database.read_matches(image_id1, image_id2))
-            image_ids = (int(image_id1), int(image_id2))
-            size_px = of_pair(extracted_px, image_ids)
-            yield _Task.of(image_ids, sides, matches, size_px)
-
-    verified = executor.map(_Estimator(options), tasks())
-    batch = list(islice(verified, PAIRS_PER_WRITE))
-    while batch:
-        with pycolmap.DatabaseTransaction(database):
-            for done in batch:
-                database.write_two_view_geometry(*done.image_ids, done.geometry)
-        if advance:
-            advance(len(batch))
-        batch = list(islice(verified, PAIRS_PER_WRITE))
-
-
-def _each_once(matches: Matches) -> Matches:
-    """Leave out repetitions: each match is evidence once, and would agree with its own copies."""
-    _, first = np.unique(matches, axis=0, return_index=True)
-    return matches if len(first) == len(matches) else matches[np.sort(first)]
-
-
-class PairVerifier:
-    """Tries matches of single pairs, with the result of :func:`verify` and the same seed."""
-
-    def __init__(
-        self,
-        ids: Mapping[str, int],
-        cameras: Mapping[str, pycolmap.Camera],
-        options: VerificationOptions,
-        extracted_px: ExtractedPx = None,
-    ) -> None:
-        """Take what is known of the images.
-
-        Args:
-            ids: in the database, by image name.
-            cameras: by image name.
-            options: of verification.
-            extracted_px: longest side that photographs were shrunk to before extraction.
-        """
-        self._ids = ids
-        self._cameras = cameras
-        self._options = options
-        self._extracted_px = extracted_px
-
-    def inliers(self, names: Names, frames: Frames, indices: Matches) -> Indices:
-        """Return the matches that the two-view geometry of a pair explains.
-
-        Args:
-            names: of the two images, in any order.
-            frames: (N, 2, 3) local affine frames of each, in pixel-centre px.
-            indices: (M, 2) raw matches, in the order of ``names``.
-
-        Returns:
-            (K, 2) of these matches; none if the geometry is rejected.
-        """
-        geometry = self.geometry(names, frames, indices)
-        found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-        is_in_order = self._ids[names[0]] < self._ids[names[1]]
-        return found if is_in_order else found[:, ::-1]
-
-    def geometry(
-        self, names: Names, frames: Frames, indices: Matches
-    ) -> pycolmap.TwoViewGeometry:
-        """Return the two-view geometry of a pair, from the image with the lower id.
-
-        Args:
-            names: of the two images, in any order.
-            frames: (N, 2, 3) local affine frames of each, in pixel-centre px.
-            indices: (M, 2) raw matches, in the order of ``names``.
-
-        Returns:
-            The geometry; an empty one if it is rejected.
-        """
-        ids = (self._ids[names[0]], self._ids[names[1]])
-        sides = (self._side(names[0], frames[0]), self._side(names[1], frames[1]))
-        if ids[0] > ids[1]:
-            ids = (ids[1], ids[0])
-            sides = (sides[1], sides[0])
-            indices = indices[:, ::-1]
-        size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry(
-            sides=sides,
-            matches=indices,
-            options=self._options,
-            extracted_px=size_px,
-        )
-
-    def _side(self, name: str, lafs: Floats) -> Side:
-        return Side(self._cameras[name], colmap_database.colmap_keypoints(lafs))
-
-
-def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:
-    """Return the number of inliers of each verified pair of image ids."""
-    with colmap_database.open_database(path) as database:
-        pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    return {
-        pycolmap.pair_id_to_image_pair(pair_id): int(count)
-        for pair_id, count in zip(pair_ids, counts, strict=True)
-        if count >= min_num_inliers
-    }

@@ -24,11 +24,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.database_verification import verified_pairs, verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import SIFT_COLMAP, GivenMethods, Method
 from colmap_affrect.comparison.results import MethodResult, SeedResult

@@ -20,7 +20,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 
-from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.colmap.database_verification import PairVerifier
 from colmap_affrect.errors import Logged, such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
 from colmap_affrect.escalation.image_set import ImageSet

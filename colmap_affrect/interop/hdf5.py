@@ -35,13 +35,10 @@ from colmap_affrect.colmap.database import (
     write_descriptors,
 )
 from colmap_affrect.colmap.database_copy import open_copy
+from colmap_affrect.colmap.database_verification import verified_pairs, verify
 from colmap_affrect.colmap.image_import import import_images
 from colmap_affrect.colmap.initial_cameras import InitialCameras
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import (
     ImageError,
     Logged,

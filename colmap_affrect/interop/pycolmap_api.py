@@ -28,8 +28,8 @@ from colmap_affrect.colmap.database import (
     open_database,
     spatial_pairs,
 )
+from colmap_affrect.colmap.database_verification import verify as verify_database
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
-from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import AffrectError, OptionError, such_as
 from colmap_affrect.escalation.escalate import escalate
 from colmap_affrect.interop import pycolmap_options as translate

@@ -10,6 +10,7 @@ not compared. Large features are seen from near and far (preemptive matching: Wu
 Linear-Time Incremental Structure from Motion, 2013).
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
@@ -32,6 +33,7 @@ from colmap_affrect.matchers.base import (
     distance_ratios,
 )
 from colmap_affrect.options import within
+from colmap_affrect.parallel.executor import one_openmp_thread
 
 CHUNK_ELEMENTS = 1 << 22  # cosines held at once, which bounds memory; resource
 # Pairs of descriptors compared at once, which bounds memory; resource
@@ -194,7 +196,8 @@ class NearestNeighbors:
         """Match all that is given of two images."""
         if not len(first.descriptors) or not len(second.descriptors):
             return Matches.none()
-        indices, ratios = self._mutual(first, second)
+        with one_openmp_thread() if self.is_coarse else nullcontext():
+            indices, ratios = self._mutual(first, second)
         best_first = np.argsort(ratios, kind="stable")
         points1 = first.keypoints[indices[best_first, 0]]
         points2 = second.keypoints[indices[best_first, 1]]
@@ -321,7 +324,10 @@ def _nearest_of_listed(
 
 def _first_of_runs(rising: Indices) -> Indices:
     """Return where each value of (E,) rising ones comes first."""
-    return np.asarray(np.flatnonzero(np.diff(rising, prepend=-1)))
+    is_first = np.empty(len(rising), np.bool_)
+    is_first[:1] = True
+    np.not_equal(rising[1:], rising[:-1], out=is_first[1:])
+    return np.asarray(np.flatnonzero(is_first))
 
 
 def _positions_in(rising: Indices, wanted: Indices) -> Indices:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.arrays import Bools, Bytes, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists
-from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
+from colmap_affrect.parallel.executor import available_cores
 
 # With fewer, loading torch takes longer than it saves (measured)
 MIN_COMPARISONS_PER_CORE = 6e8
@@ -206,7 +206,8 @@ def _packed(codes: NDArray[np.int8]) -> Any:
 
 def _filled_up(codes: NDArray[np.int8]) -> NDArray[np.int8]:
     """Add rows of zeros to (N, D) codes up to a multiple of ``SIZE_MULTIPLE``."""
-    return np.pad(codes, ((0, -len(codes) % SIZE_MULTIPLE), (0, 0)))
+    num_missing = -len(codes) % SIZE_MULTIPLE
+    return np.pad(codes, ((0, num_missing), (0, 0))) if num_missing else codes
 
 
 def _cosine_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Bytes:
@@ -221,11 +222,10 @@ def _cosine_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Bytes:
     shifted = torch.from_numpy(_filled_up(codes).view(np.uint8) ^ ZERO_CODE)
     scale = torch.tensor([unit])
     zero = torch.zeros(1, dtype=torch.int32)
-    with one_openmp_thread():
-        product = torch.ops.onednn.qlinear_pointwise(
-            shifted, 1.0, ZERO_CODE, packed, scale, zero, None,
-            CODE_STEP, 0, torch.uint8, "none", [], "",
-        )  # fmt: skip
+    product = torch.ops.onednn.qlinear_pointwise(
+        shifted, 1.0, ZERO_CODE, packed, scale, zero, None,
+        CODE_STEP, 0, torch.uint8, "none", [], "",
+    )  # fmt: skip
     return np.asarray(product.numpy()[: len(codes)])
 
 

@@ -20,9 +20,10 @@ from colmap_affrect.colmap.database_copy import (
     has_matches,
     read_names,
 )
+from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError, Logged, Option, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import digest_of

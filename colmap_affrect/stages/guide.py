@@ -17,8 +17,8 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.connections import weakly_connected_images
 from colmap_affrect.colmap.database import cameras_of_images
+from colmap_affrect.colmap.database_verification import PairVerifier
 from colmap_affrect.colmap.two_views import CALIBRATED, pair_model
-from colmap_affrect.colmap.verification import PairVerifier
 from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import are_individual_shapes

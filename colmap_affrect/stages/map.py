@@ -8,8 +8,8 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import NOTHING
 from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.model_files import model_folder
-from colmap_affrect.colmap.verification import verify
 from colmap_affrect.errors import ConflictError, Option
 from colmap_affrect.geometry.lines import SHIFTED_SIGMA, LineCamera
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask

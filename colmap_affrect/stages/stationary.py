@@ -14,7 +14,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
+from colmap_affrect.colmap.database_verification import NUM_CACHED_IMAGES
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import damage, how_to_make_again
 from colmap_affrect.geometry.arrays import Array, Floats, Indices

@@ -4,11 +4,8 @@ import time
 from collections.abc import Sequence
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import (
-    ExtractedPx,
-    VerificationOptions,
-    verify_pairs,
-)
+from colmap_affrect.colmap.database_verification import ExtractedPx, verify_pairs
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.stage_report import StageReport

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from registration import SUBSETS
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.verification import PairVerifier
+from colmap_affrect.colmap.database_verification import PairVerifier
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import PairState, kind_of, terms
 from colmap_affrect.project.workspace import Workspace

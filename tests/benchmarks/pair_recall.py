@@ -19,7 +19,7 @@ from pathlib import Path
 from machine import parser_of, table
 
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.verification import verified_pairs
+from colmap_affrect.colmap.database_verification import verified_pairs
 from colmap_affrect.pairs.lists import Pair, sequence_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT

@@ -21,12 +21,9 @@ from machine import describe_machine, parser_of, span, table
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_verification import verified_pairs, verify
 from colmap_affrect.colmap.image_import import import_images
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.method_run import extract_sift, match_sift
 from colmap_affrect.comparison.methods import SIFT, Method, parse_method
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions

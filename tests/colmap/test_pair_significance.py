@@ -18,6 +18,11 @@ from colmap_affrect.colmap.database import (
     unverified_pairs,
     write_matches,
 )
+from colmap_affrect.colmap.database_verification import (
+    verified_pairs,
+    verify,
+    verify_pairs,
+)
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.colmap.verification import (
     Side,
@@ -25,9 +30,6 @@ from colmap_affrect.colmap.verification import (
     estimate_geometry,
     max_error_px,
     two_view_options,
-    verified_pairs,
-    verify,
-    verify_pairs,
 )
 from colmap_affrect.geometry.affine import project, rotation, transform_lafs
 from colmap_affrect.geometry.parallax import text_line_matches
@@ -239,9 +241,12 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
         last = database.read_keypoints(4)
     with monkeypatch.context() as patched:
         patched.setattr(
-            "colmap_affrect.colmap.verification.estimate_geometry", interrupted
+            "colmap_affrect.colmap.database_verification.estimate_geometry",
+            interrupted,
         )
-        patched.setattr("colmap_affrect.colmap.verification.PAIRS_PER_WRITE", 1)
+        patched.setattr(
+            "colmap_affrect.colmap.database_verification.PAIRS_PER_WRITE", 1
+        )
         with pytest.raises(KeyboardInterrupt):
             verify(path, options)
     assert unverified_pairs(path).tolist() == [[3, 4]]

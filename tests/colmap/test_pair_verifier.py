@@ -6,11 +6,10 @@ import numpy as np
 from strategies import Array
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database_verification import PairVerifier, _each_once
 from colmap_affrect.colmap.verification import (
-    PairVerifier,
     Side,
     VerificationOptions,
-    _each_once,
     estimate_geometry,
 )
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs

@@ -10,13 +10,10 @@ from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN, SEED, synthesize
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.model_files import model_poses
 from colmap_affrect.colmap.native_options import differences, flat_values
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    two_view_options,
-    verify,
-)
+from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.comparison.results import pair_errors
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask

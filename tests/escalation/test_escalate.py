@@ -15,7 +15,8 @@ from results import database_content
 from verified import copy_of, verified
 
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
+from colmap_affrect.colmap.database_verification import PairVerifier
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.escalation import escalate as escalation
 from colmap_affrect.escalation.escalate import Escalation

@@ -20,7 +20,8 @@ from wall_scene import views, write_scene
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.database_verification import verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.mappers import adjustment
 from colmap_affrect.mappers.adjustment import FINAL, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask

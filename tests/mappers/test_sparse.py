@@ -17,13 +17,14 @@ from wall_scene import is_inside, project, turned, views, wall, write_scene
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
+from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.model_files import (
     Poses,
     model_poses,
     pose_errors,
     relative_pose,
 )
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
 from colmap_affrect.mappers.reliability import score_images

@@ -138,7 +138,8 @@ def test_torch_without_the_products_matches_exactly(
     )
     has_fast_8_bit_products.cache_clear()
     features = LocalFeatures.empty(128)
-    assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None
+    image = matcher.prepare(ImageFeatures(features, (32, 32), "rootsift"))
+    assert image.features.coarse is None
 
 
 def test_torch_is_loaded_meanwhile_where_there_will_be_enough_to_match(

@@ -24,7 +24,8 @@ from colmap_affrect import CompareOptions, Extension, RunOptions, match_descript
 from colmap_affrect import match_feature_sets as match_sets
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.database_verification import verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.doctor import diagnose
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.geometry.neighbors import without_duplicates

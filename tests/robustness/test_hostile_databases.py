@@ -17,11 +17,8 @@ from small_scene import write_photographs
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.colmap.verification import (
-    VerificationOptions,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.database_verification import verified_pairs, verify
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.doctor import Diagnosis, examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.affine import rotation
