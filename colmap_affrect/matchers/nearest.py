@@ -10,6 +10,7 @@ not compared. Large features are seen from near and far (preemptive matching: Wu
 Linear-Time Incremental Structure from Motion, 2013).
 """
 
+import math
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
@@ -42,12 +43,11 @@ NO_LIMIT = 2.0  # of ratios, which are at most 1; theory
 # Features of each image, the largest, by which a pair may be given up; of the strongest as many say
 # far less: of 203 verified pairs of Saharov, 31 show nothing in common by them, 3 by the largest
 NUM_LOOKED_AT = 2048  # measured
-# Of their matches, those that agree with their neighbours, below which a pair is given up. Of 1,090
-# verified pairs of ten scenes 6 have fewer, of 1,177 others 878; measured
+# Of all features, at most, so that a look takes a quarter of the comparisons; resource
+SHARE_LOOKED_AT = 0.5
+# Of the matches of these features, those that agree with their neighbours, below which a pair is
+# given up. Of 1,090 verified pairs of ten scenes 6 have fewer, of 1,177 others 873; measured
 MIN_CONSISTENT = 2
-# How many times as many comparisons all features of a pair take at least, where it is looked at
-# before; resource
-MIN_SAVED = 4
 
 
 class NearestOptions(MatcherOptions):
@@ -156,7 +156,8 @@ class NearestNeighbors:
             return MatchableImage(prepared)
         areas = np.abs(np.linalg.det(features.lafs[:, :, :2]))
         largest_first = np.argsort(-areas, kind="stable")
-        rows = np.sort(largest_first[:NUM_LOOKED_AT])
+        num_looked_at = math.ceil(SHARE_LOOKED_AT * len(areas))
+        rows = np.sort(largest_first[: min(num_looked_at, NUM_LOOKED_AT)])
         largest = LargestFeatures(
             self._comparable(descriptors[rows], features.keypoints[rows]),
             rows,
@@ -184,7 +185,7 @@ class NearestNeighbors:
         Returns:
             Matches, one to one: of the largest features alone where these have nothing in common.
         """
-        if first.largest and second.largest and _is_worth_a_look(first, second):
+        if first.largest and second.largest:
             seen = self._match(first.largest.features, second.largest.features)
             if _shows_nothing(first.largest, second.largest, seen):
                 rows1 = first.largest.rows[seen.indices[:, 0]]
@@ -240,12 +241,6 @@ def _frames_tell(lafs: Floats) -> bool:
     shapes = lafs[:, :, :2].reshape(len(lafs), 4)
     keypoints = np.concatenate([lafs[:, :, 2], shapes], axis=1)
     return telling_shapes(keypoints) is not None
-
-
-def _is_worth_a_look(first: MatchableImage, second: MatchableImage) -> bool:
-    """Tell whether comparing all features takes far longer than comparing the largest."""
-    num_all = len(first.features.descriptors) * len(second.features.descriptors)
-    return num_all >= MIN_SAVED * NUM_LOOKED_AT**2
 
 
 def _shows_nothing(

@@ -281,16 +281,13 @@ def test_pair_is_given_up_where_less_than_two_matches_agree_with_their_neighbour
     assert (len(found) <= few_looked_at) == is_given_up
 
 
-@pytest.mark.parametrize(("share", "is_looked_at"), [(2.5, False), (1.5, True)])
-def test_pair_is_looked_at_where_that_saves_three_quarters(
-    monkeypatch: pytest.MonkeyPatch, share: float, *, is_looked_at: bool
-) -> None:
-    monkeypatch.setattr(nearest, "NUM_LOOKED_AT", int(NUM_SHAPED * share / 4))
+def test_pair_is_looked_at_by_half_of_its_features_at_most() -> None:
     first = shaped_image(1)
     second = shaped_image(2)
-    every = matched_rows(first, second, may_give_up=False)
     some = matched_rows(first, second, may_give_up=True)
-    assert (len(some) < len(every)) == is_looked_at
+    alone = [largest_of(image, NUM_SHAPED // 2) for image in (first, second)]
+    of_half = matched_rows(alone[0], alone[1], may_give_up=False)
+    assert 40 < len(some) == len(of_half) <= NUM_SHAPED // 2
 
 
 def test_pairs_are_looked_at_by_two_thousand_features() -> None:
