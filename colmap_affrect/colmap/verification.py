@@ -157,28 +157,46 @@ def _significant_geometry(
 
     Its inliers are rows, twice. None where there are too few of them, or chance made them.
     """
-    num_matches = len(keypoints[0])
-    least = max(options.min_num_inliers, options.min_inlier_ratio * num_matches)
-
-    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
-        of_chance = significance(found, cameras, keypoints, options.max_error_px)
-        return of_chance < options.min_significance
-
+    judge = _Judge(cameras, keypoints, options)
     geometry = _searched_geometry(cameras, keypoints, options)
-    if geometry is None or len(geometry.inlier_matches) < least:
+    if geometry is None or not judge.has_enough_inliers(geometry):
         return None
-    if not options.min_significance:
-        return geometry
-    if is_chance(geometry):
+    if judge.is_chance(geometry):
         points = (_positions(keypoints[0]), _positions(keypoints[1]))
-        geometry = _planar_geometry(geometry, points, options)
-        is_found = len(geometry.inlier_matches) >= least and not is_chance(geometry)
-        return geometry if is_found else None
-    if len(geometry.inlier_matches) < MAX_FEW_INLIERS:
-        found = _searched_again(geometry, cameras, keypoints, options)
-        if found and len(found.inlier_matches) >= least and not is_chance(found):
-            return found
-    return geometry
+        planar = _planar_geometry(geometry, points, options)
+        return planar if judge.accepts(planar) else None
+    if len(geometry.inlier_matches) >= MAX_FEW_INLIERS or not options.min_significance:
+        return geometry
+    found = _searched_again(geometry, cameras, keypoints, options)
+    return found if found and judge.accepts(found) else geometry
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Judges geometries by all matches of a pair, whatever they were found in."""
+
+    cameras: Cameras
+    keypoints: Keypoints
+    options: VerificationOptions
+
+    def accepts(self, geometry: pycolmap.TwoViewGeometry) -> bool:
+        """Tell whether a geometry has enough inliers, and chance did not make them."""
+        return self.has_enough_inliers(geometry) and not self.is_chance(geometry)
+
+    def has_enough_inliers(self, geometry: pycolmap.TwoViewGeometry) -> bool:
+        """Tell whether a geometry has as many inliers as a pair is verified with."""
+        least = self.options.min_inlier_ratio * len(self.keypoints[0])
+        num_inliers = len(geometry.inlier_matches)
+        return num_inliers >= max(self.options.min_num_inliers, least)
+
+    def is_chance(self, geometry: pycolmap.TwoViewGeometry) -> bool:
+        """Tell whether chance would make such a geometry now and then; never where all count."""
+        if not self.options.min_significance:
+            return False
+        of_chance = significance(
+            geometry, self.cameras, self.keypoints, self.options.max_error_px
+        )
+        return of_chance < self.options.min_significance
 
 
 def _searched_geometry(
