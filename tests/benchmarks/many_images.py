@@ -52,6 +52,7 @@ TEXELS_PER_METRE = 150.0
 STEP_M = 0.14
 SIGHT_M = 40.0
 DEFAULT_NUM_IMAGES = 1000
+UNKNOWN = 0.0, 0.0  # seconds and MiB of a stage
 DRAWN_FROM_S = 1.0  # a stage that takes less for all numbers of images is left out
 PANELS = (
     "processor time, s",
@@ -325,13 +326,14 @@ def drawn_stages(found: Sequence[dict[str, Any]]) -> list[str]:
 def points_of(
     found: Sequence[dict[str, Any]], stage: str, panel: int
 ) -> tuple[list[int], list[float]]:
-    """Return numbers of images, and what a stage cost for each; runs without it are left out."""
+    """Return numbers of images, and what a stage cost for each, where that is known."""
     counts = []
     values = []
     for one in found:
-        if stage in one["first"]:
+        value = one["first"].get(stage, UNKNOWN)[panel]
+        if value > 0.0:
             counts.append(one["num_images"])
-            values.append(one["first"][stage][panel])
+            values.append(value)
     return counts, values
 
 
@@ -373,11 +375,9 @@ def draw(found: Sequence[dict[str, Any]], path: Path) -> None:
     times.plot(*guide_line(found), color="black", linestyle="--", label="n log n")
     times.legend(fontsize="small")
     if any(one["beside_other_work"] for one in found):
-        figure.supxlabel(
-            "dotted: measured stage by stage, beside other work", fontsize="small"
-        )
+        figure.supxlabel("dotted: measured beside other work", fontsize="small")
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
 
 
 def parsed_arguments() -> Namespace:
