@@ -53,17 +53,20 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
+    pytest.importorskip("distributed")
     result = tmp_path / "new" / "whole.json"
     diagram = tmp_path / "drawn" / "whole.png"
     given = ["--scenes-path", "sample_scenes", "--sets", "courtyard:3"]
-    given += ["--peers", "sift-colmap", "rectified", "--num-rounds", "1"]
+    given += ["--peers", "sift-colmap", "rectified", "rectified+workers"]
+    given += ["--num-rounds", "1"]
     written = ["--output-path", result, "--diagram-path", diagram]
     text = run_script("tests/benchmarks/whole_run.py", *given, *written)
     runs = json.loads(result.read_text())["runs"]
-    assert [run["correct"] for run in runs] == [0, 3]
+    assert [run["correct"] for run in runs] == [0, 3, 3]
     for run in runs:
         assert 0.0 < sum(run["stages_s"].values()) < run["wall_s"]
     assert "| courtyard:3 | 3 | rectified | " in text
+    assert "| courtyard:3 | 3 | rectified+workers | " in text
     assert diagram.read_bytes().startswith(b"\x89PNG")
 
 
