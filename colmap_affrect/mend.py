@@ -7,6 +7,7 @@ A database whose rows have another digest was changed by another program. While 
 there is no seal, so that a killed one leaves none.
 """
 
+import hashlib
 import logging
 import shlex
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,6 @@ from colmap_affrect.colmap.checks import (
 from colmap_affrect.colmap.image_import import record_cameras
 from colmap_affrect.colmap.tables import damage_of, rows_digest
 from colmap_affrect.errors import AffrectError, Logged, Words
-from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.record import stamp_of
@@ -93,8 +93,8 @@ def mend_and_seal(
         return
     if loss:
         _make_again(context, loss, follows=follows)
-    elif not discards and _is_current(sealed, path):
-        context.graph.know_digest(sealed[0])
+    elif not discards:
+        _know_digest(context, sealed)
     workspace.seal.unlink(missing_ok=True)
     try:
         with context.graph.keep_open():
@@ -142,14 +142,17 @@ def _sealed(workspace: Workspace) -> list[str]:
     return []
 
 
-def _is_current(sealed: Sequence[str], path: Path) -> bool:
-    """Tell whether a seal is whole, and the database the one that it was left beside."""
-    return sealed[1:] == [_stamp(path), _digest_of_seal(sealed[:2])]
+def _know_digest(context: Context, sealed: Sequence[str]) -> None:
+    """Take the digest of a seal that is whole and was left beside this database."""
+    path = context.workspace.database
+    if sealed[1:] == [_stamp(path), _digest_of_seal(sealed[:2])]:
+        context.graph.know_digest(sealed[0])
 
 
 def _digest_of_seal(lines: Sequence[str]) -> str:
     """Return the last line of a seal, another one where COLMAP may migrate the database."""
-    return digest_of([*lines, pycolmap.__version__])
+    text = "\n".join([*lines, pycolmap.__version__])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _stamp(path: Path) -> str:

@@ -435,6 +435,16 @@ def measure_all(
     return found
 
 
+def print_tables(found: Sequence[dict[str, Any]]) -> None:
+    """Print the costs of first runs, of idle ones where these were measured, and what is right."""
+    for kind in ("first", "idle"):
+        known = [one for one in found if kind in one]
+        header = ("stage", *[f"{one['num_images']} images" for one in known], "growth")
+        print(f"{kind} run\n\n{table(header, rows_of(known, kind))}")
+    for one in found:
+        print(one["scores"])
+
+
 def main() -> None:
     """Print the tables, and draw the diagram."""
     arguments = parsed_arguments()
@@ -448,12 +458,7 @@ def main() -> None:
         options = arguments.options or ("--pairs", "retrieval")
         found += measure_all(arguments.output_path, counts, options)
     found = by_number(found)
-    for kind in ("first", "idle"):
-        known = [one for one in found if kind in one]
-        header = ("stage", *[f"{one['num_images']} images" for one in known], "growth")
-        print(f"{kind} run\n\n{table(header, rows_of(known, kind))}")
-    for one in found:
-        print(one["scores"])
+    print_tables(found)
     if arguments.diagram_path:
         arguments.diagram_path.parent.mkdir(parents=True, exist_ok=True)
         draw(found, arguments.diagram_path)
