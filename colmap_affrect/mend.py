@@ -2,20 +2,22 @@
 
 The stores, or the database that was copied, are what is true. Each command leaves a *seal*, the
 text file ``database.db.seal`` beside ``database.db``. It has a digest of the rows of the database,
-and size and times of its file: while these stay, the rows need not be read. A database whose rows
-have another digest was changed by another program. While a command works there is no seal, so that
-a killed one leaves none.
+size and times of its file, and a digest of both lines: while these stay, the rows need not be read.
+A database whose rows have another digest was changed by another program. While a command works
+there is no seal, so that a killed one leaves none.
 """
 
+import hashlib
 import logging
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Literal
 
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import (
     FATAL_AS_IT_IS,
     FATAL_BEFORE_MAPPING,
@@ -83,19 +85,23 @@ def mend_and_seal(
         _check_users_database(path)
         yield
         return
-    loss = None if discards else _loss_of(workspace)
+    sealed = _sealed(workspace)
+    loss = None if discards else _loss_of(workspace, sealed)
     if maps and loss == CHANGED:
         _take_as_it_is(context)
         yield  # the seal stays: other commands make the database again
         return
     if loss:
         _make_again(context, loss, follows=follows)
+    elif not discards:
+        _know_digest(context, sealed)
     workspace.seal.unlink(missing_ok=True)
     try:
         with context.graph.keep_open():
             yield
     except AffrectError:
         if path.exists() and not damage_of(path):  # else it is looked through next time
+            context.graph.forget()  # it may have been changed in part
             _seal(context)
         raise
     _seal(context)
@@ -124,7 +130,29 @@ def _seal(context: Context) -> None:
     if path.exists() and workspace.started_stages:
         # One that is not sealed is looked through next time.
         with suppress(AffrectError):
-            replace_text(workspace.seal, f"{context.graph.digest()}\n{_stamp(path)}\n")
+            lines = [context.graph.digest(), _stamp(path)]
+            seal = "\n".join([*lines, _digest_of_seal(lines)])
+            replace_text(workspace.seal, f"{seal}\n")
+
+
+def _sealed(workspace: Workspace) -> list[str]:
+    """Return the lines of the seal that the last command left, none without."""
+    with suppress(OSError, UnicodeDecodeError):
+        return read_regular_text(workspace.seal).splitlines()
+    return []
+
+
+def _know_digest(context: Context, sealed: Sequence[str]) -> None:
+    """Take the digest of a seal that is whole and was left beside this database."""
+    path = context.workspace.database
+    if sealed[1:] == [_stamp(path), _digest_of_seal(sealed[:2])]:
+        context.graph.know_digest(sealed[0])
+
+
+def _digest_of_seal(lines: Sequence[str]) -> str:
+    """Return the last line of a seal, another one where COLMAP may migrate the database."""
+    text = "\n".join([*lines, pycolmap.__version__])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _stamp(path: Path) -> str:
@@ -132,15 +160,12 @@ def _stamp(path: Path) -> str:
     return stamp_of(database_files(path)[:2])
 
 
-def _loss_of(workspace: Workspace) -> Loss | None:
+def _loss_of(workspace: Workspace, sealed: Sequence[str]) -> Loss | None:
     """Return why the database is not what the last command left, None if it is."""
     path = workspace.database
     begun = workspace.started_stages
     if not path.exists():
         return Loss("missing") if "verify" in begun else None
-    sealed = list[str]()
-    with suppress(OSError, UnicodeDecodeError):
-        sealed = read_regular_text(workspace.seal).splitlines()
     if not begun or _stamp(path) in sealed:
         return None
     try:

@@ -31,6 +31,7 @@ TEXTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 FOREIGN = {
     "--import_path", "--database_path", "--image_path", "--output_path", "--no-deps",
     "--Mapper.tri_ignore_two_view_tracks", "--nthreads", "--nworkers", "--claim",
+    "--preload",
 }  # fmt: skip
 """Options of other programs that the pages name."""
 MAX_PICTURE_BYTES = 1_200_000

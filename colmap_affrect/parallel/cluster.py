@@ -32,6 +32,7 @@ from threadpoolctl import threadpool_limits
 from colmap_affrect.errors import AffrectError, Option, OptionError
 from colmap_affrect.parallel.cluster_watch import ClusterWatch
 from colmap_affrect.parallel.executor import Result, Task, in_order
+from colmap_affrect.parallel.freed_memory import keep_freed_memory, return_freed_memory
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
@@ -106,10 +107,17 @@ def _function(
 ) -> Callable[[Any], Any]:
     """Unpickle a function once per process; the next one replaces it and frees its memory."""
     require_environment(dict(expected))
+    keep_freed_memory()
     threadpool_limits(1, user_api="blas")
     cv2.setNumThreads(1)
     function: Callable[[Any], Any] = pickle.loads(pickled)  # noqa: S301 - from the driver
     return function
+
+
+def _forget() -> None:
+    """Free what a worker keeps of a run."""
+    _function.cache_clear()
+    return_freed_memory()
 
 
 @dataclass(frozen=True)
@@ -276,7 +284,7 @@ class Cluster:
         with suppress(OSError, RuntimeError, CancelledError, AffrectError):
             self._watch.look()
             if not self._watch.is_lost:
-                self._client.run(_function.cache_clear, on_error="ignore")
+                self._client.run(_forget, on_error="ignore")
 
     def map(
         self,

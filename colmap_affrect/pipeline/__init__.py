@@ -131,7 +131,7 @@ def _run(
     context = replace(context, progress=context.progress.with_forecast(forecast))
     _prepare_parts(context, recipe)
     later = options.later_stages()
-    if is_new:
+    if is_new and context.executor is None:
         recipe.matching.load_meanwhile(num_pairs)
     with workspace.locked(), mend_and_seal(context, follows=False, discards=overwrite):
         reports = [

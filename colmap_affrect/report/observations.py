@@ -45,14 +45,22 @@ class Observations:
         points = self.point_ids[order]
         rows = self.rows[order]
         counts = np.zeros(num_images**2, dtype=np.int64)
+        waiting = list[Indices]()  # rows of two photographs as one number
+        num_waiting = 0
+        # The other observations of a point are the next ones of its row
+        left = np.arange(len(points))
         step = 1
-        while True:  # the other observations of a point are the next ones of its row
-            is_same = points[step:] == points[:-step]
-            if not is_same.any():
-                break
-            keys = rows[:-step][is_same] * num_images + rows[step:][is_same]
-            counts += np.bincount(keys, minlength=num_images**2)
+        while len(left):
+            left = left[left + step < len(points)]
+            left = left[points[left + step] == points[left]]
+            waiting.append(rows[left] * num_images + rows[left + step])
+            num_waiting += len(left)
             step += 1
+            # To go through all pairs of photographs for each step would take longest of all
+            if num_waiting >= len(counts) or not len(left):
+                counts += np.bincount(np.concatenate(waiting), minlength=num_images**2)
+                waiting.clear()
+                num_waiting = 0
         one_way = counts.reshape(num_images, num_images)
         both_ways: Indices = one_way + one_way.T
         np.fill_diagonal(both_ways, 0)

@@ -15,6 +15,10 @@ from colmap_affrect.project.report import SOURCES, SURE, ModelSummary
 from colmap_affrect.report.observations import ModelReader, registered_images
 
 NUM_NEIGHBOURS = 5  # that are named of each photograph; the viewer shows all
+MODEL_FIGURES = (  # what the files of a model say
+    "num_points", "mean_error_px", "neighbours", "num_neighbours", "focal_px", "distortion_px",
+    "shift_px",
+)  # fmt: skip
 
 Quality = Literal["sure", "unsure", "doubtful", "missing"]
 """How far a pose can be trusted: right with 90 per cent or more, between, rather wrong than right;
@@ -70,6 +74,7 @@ def photographs_of_report(
     models: Sequence[ModelSummary],
     cameras: Sequence[Mapping[str, Any]],
     lines: Mapping[str, LineReport],
+    kept: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> dict[str, PhotographReport]:
     """Return what is known of each photograph.
 
@@ -79,6 +84,7 @@ def photographs_of_report(
         models: summaries of the models, the largest first.
         cameras: entries of ``report.json``, which say where focal lengths are from.
         lines: what straight lines say, by name.
+        kept: figures of these models by name, which need not be counted again.
 
     Returns:
         Reports by name, in the order of the names.
@@ -86,7 +92,7 @@ def photographs_of_report(
     begun = _of_cameras(cameras)
     placed = dict[str, dict[str, Any]]()
     for number, model in enumerate(models):
-        figures = _of_model(reader, number)
+        figures = _of_model(reader, number) if kept is None else kept
         for name in model.registered_names:
             if name not in placed:
                 placed[name] = {

@@ -50,6 +50,8 @@ class RunReport(ReconstructionReport):
     """Folder of all results."""
     photographs: dict[str, PhotographReport] = field(default_factory=dict)
     """Figures of each photograph, by name."""
+    made_from: str = ""
+    """Digest of these figures and of the models that they are of."""
     focal_contradictions: tuple[FocalContradiction, ...] = ()
     """Focal lengths of EXIF or the user that straight lines contradict."""
 

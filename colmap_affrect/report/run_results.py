@@ -18,6 +18,7 @@ from colmap_affrect.report.advice import (
     command_with_masks,
     command_with_tie_points,
 )
+from colmap_affrect.report.kept_figures import figures_digest, kept_figures, models_key
 from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.page_key import is_current, page_key
 from colmap_affrect.report.pair_lines import LinesOfRun
@@ -104,6 +105,15 @@ def _report(
     escalated = escalation_summary(context)
     escalates = escalated.matched_again or escalated.untried
     focal_contradictions = contradictions_of_report(context, line_findings)
+    key = models_key(workspace.sparse, len(result.models))
+    photographs = photographs_of_report(
+        models,
+        result.names,
+        result.models,
+        cameras,
+        lines,
+        kept=kept_figures(workspace.report, key),
+    )
     return RunReport(
         output_path=workspace.path,
         images_total=len(result.names),
@@ -117,9 +127,8 @@ def _report(
         mapping=result.options.to_mapping(),
         cameras=cameras,
         lines=lines,
-        photographs=photographs_of_report(
-            models, result.names, result.models, cameras, lines
-        ),
+        photographs=photographs,
+        made_from=figures_digest(key, photographs),
         focal_contradictions=focal_contradictions,
         extended=tuple(result.extended),
         advice=advice(

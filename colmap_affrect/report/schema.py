@@ -132,6 +132,8 @@ class ReportFile(Described):
     """Names of these."""
     photographs: dict[str, PhotographReport]
     """Figures of each photograph, by name."""
+    made_from: str
+    """Digest of these figures and of the models that they are of; empty without models."""
     probabilities: dict[str, float]
     """That the pose of a photograph is right within 5 degrees."""
     unsure: dict[str, list[DoubtEntry]]

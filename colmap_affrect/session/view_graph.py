@@ -134,8 +134,18 @@ class ViewGraph:
 
     def num_inliers(self, min_num_inliers: int) -> dict[Pair, int]:
         """Return the number of inliers of each pair that has at least so many."""
-        inliers = self.inliers(min_num_inliers)
-        return {pair: len(matches) for pair, matches in inliers.items()}
+        self._forget_if_gone()
+        if self._inliers is None:
+            with self.open_to_read() as database:
+                self._images = self._images or _read_images(database)
+                counts = _read_num_inliers(database, self._images)
+        else:
+            counts = {pair: len(rows) for pair, rows in self._inliers.items()}
+        return {pair: num for pair, num in counts.items() if num >= min_num_inliers}
+
+    def know_digest(self, digest: str) -> None:
+        """Take the digest that all rows have now, so that nobody need read them for it."""
+        self._digest = digest
 
     def digest(self) -> str:
         """Return a SHA-256 of all rows but descriptors."""
@@ -187,4 +197,18 @@ def _read_inliers(
         if len(matches):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             found[names[first], names[second]] = matches
+    return found
+
+
+def _read_num_inliers(
+    database: pycolmap.Database, images: ImageRows
+) -> dict[Pair, int]:
+    """Return the number of inliers of each verified pair, without reading them."""
+    names = {image_id: name for name, image_id in images.ids.items()}
+    found = dict[Pair, int]()
+    pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        if count:
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            found[names[first], names[second]] = int(count)
     return found

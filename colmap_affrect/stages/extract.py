@@ -133,7 +133,11 @@ def _prepared(
     if known.keys() >= now.keys() and not _changed(known, now):
         return None
     return one_image.prepare(
-        recipe.extraction, context.resources, list(now), context.progress
+        recipe.extraction,
+        context.resources,
+        list(now),
+        context.progress,
+        only_first=True,
     )
 
 

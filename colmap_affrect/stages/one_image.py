@@ -24,7 +24,7 @@ from colmap_affrect.features.base import (
     FeatureExtractor,
     NetworkContext,
 )
-from colmap_affrect.features.weights import digests, resolve
+from colmap_affrect.features.weights import digests, is_published, resolve
 from colmap_affrect.geometry.affine import transform_lafs
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.conventions import (
@@ -95,12 +95,16 @@ class ImageExtractor:
     # Files of the networks by key
     weights: Mapping[str, Path] = field(default_factory=dict)
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
+    only_first: bool = (
+        False  # it has no other level, but for weights that are not published
+    )
     # Held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(default_factory=Lock)
 
     def __reduce__(self) -> tuple[Any, ...]:
         sent = digests(self.weights)
-        return _prepare_elsewhere, (self.options, self.resources, sent)
+        given = self.options, self.resources, sent, self.only_first
+        return _prepare_elsewhere, given
 
     def __call__(self, task: ImageTask) -> ExtractedImage | UnusableImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
@@ -304,8 +308,7 @@ def find_weights(
     """
     keys = set[str]()
     for level in _usable_levels(options, resources).values():
-        for part in level.network_parts:
-            keys.update(part.weights)
+        keys |= _weights_of(level)
     return resolve(sorted(keys), resources.weights_path, progress=progress)
 
 
@@ -321,6 +324,8 @@ def prepare(
     resources: Resources | None = None,
     image_names: Sequence[str] | None = None,
     progress: Progress = SILENT,
+    *,
+    only_first: bool = False,
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
@@ -332,6 +337,8 @@ def prepare(
         image_names: of the images to come, to see whether there are depth maps for them; None: do
             not look.
         progress: where to show downloads.
+        only_first: build no parts of levels of escalation, so that torch is not loaded for them;
+            files that are not the published ones are tried nevertheless.
 
     Returns:
         What is called for every photograph.
@@ -344,6 +351,8 @@ def prepare(
     options.check_depth()
     levels = _usable_levels(options, resources)
     weights = find_weights(options, resources, progress)
+    if only_first:
+        levels = _first_and_unpublished(levels, weights)
     uses_network = any(level.uses_networks for level in levels.values())
     network = NetworkContext(
         weights, resources.require_device(uses_network=uses_network)
@@ -361,7 +370,25 @@ def prepare(
         rectifiers=_rectifiers(levels, network, depth),
         weights=weights,
         resources=resources,
+        only_first=only_first,
     )
+
+
+def _first_and_unpublished(
+    levels: Mapping[int, Level], weights: Mapping[str, Path]
+) -> dict[int, Level]:
+    """Return the first level, and those with files of weights that are not the published ones."""
+    published = {key for key, path in weights.items() if is_published(key, path)}
+    found = {}
+    for number, level in levels.items():
+        if number == 0 or not published.issuperset(_weights_of(level)):
+            found[number] = level
+    return found
+
+
+def _weights_of(level: Level) -> set[str]:
+    """Return the keys of the weights that extraction by a level needs."""
+    return {key for part in level.network_parts for key in part.weights}
 
 
 def _rectifiers(
@@ -383,9 +410,12 @@ def _rectifiers(
 
 
 def _prepare_elsewhere(
-    options: ExtractionOptions, resources: Resources, sent: Mapping[str, str]
+    options: ExtractionOptions,
+    resources: Resources,
+    sent: Mapping[str, str],
+    only_first: bool,
 ) -> ImageExtractor:
     """Prepare a recipe in another process."""
-    extractor = prepare(options, resources)
+    extractor = prepare(options, resources, only_first=only_first)
     require_same_files(extractor.weights, sent)
     return extractor

@@ -16,6 +16,9 @@ import sys
 
 from dask_kubernetes.operator import KubeCluster, make_cluster_spec
 
+# What workers load before they are asked
+PRELOADED = "--preload colmap_affrect.stages.match --preload torch"
+
 
 def main() -> int:
     """Return the exit code of colmap-affrect."""
@@ -42,7 +45,7 @@ def main() -> int:
         name="colmap-affrect",
         image=options.image,
         n_workers=options.workers,
-        worker_command=f"dask worker --nthreads {options.cores}",
+        worker_command=f"dask worker --nthreads {options.cores} {PRELOADED}",
     )
     # The command 'dask-scheduler' that dask-kubernetes starts is no more since distributed 2026.
     scheduler = spec["spec"]["scheduler"]["spec"]["containers"][0]

@@ -13,6 +13,9 @@ import sys
 
 from dask_jobqueue import SLURMCluster
 
+# What workers load before they are asked
+PRELOADED = ["--preload", "colmap_affrect.stages.match", "--preload", "torch"]
+
 
 def main() -> int:
     """Return the exit code of colmap-affrect."""
@@ -32,6 +35,7 @@ def main() -> int:
         processes=1,  # a worker works on as many images as it has cores
         memory=options.memory,
         walltime=options.walltime,
+        worker_extra_args=PRELOADED,
     ) as cluster:
         cluster.scale(jobs=options.jobs)
         cluster.wait_for_workers(1)

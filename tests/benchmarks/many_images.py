@@ -1,12 +1,17 @@
 """Time and memory of each stage of ``run``, and its errors, on more and more images. Usage:
 
-    python tests/benchmarks/many_images.py --output-path out/many --num-images 50 200 1000
+    python tests/benchmarks/many_images.py --output-path out/many --num-images 50 200 1000 \
+        --diagram-path out/many.png
 
 Renders photographs of a street of different houses from random places, once, seven to the metre,
 and runs the command on the first of them. Prints, for each number, the processor time of each stage
 (all threads and child processes) and the largest memory that the process had while it worked, and
 how many images of the largest model are where they were rendered; ``costs.json`` has the same. A
-stage that takes ``n`` times as long for ``n`` times as many images has a growth of 1.
+stage that takes ``n`` times as long for ``n`` times as many images has a growth of 1. The diagram
+shows time and memory against the number of images, also of other calls::
+
+    python tests/benchmarks/many_images.py --output-path out/many \
+        --costs-paths out/many/costs.json out/more/costs.json --diagram-path out/many.png
 """
 
 from __future__ import annotations
@@ -17,9 +22,11 @@ import os
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +51,13 @@ PAVEMENT_M = 12.0
 TEXELS_PER_METRE = 150.0
 STEP_M = 0.14
 SIGHT_M = 40.0
+DEFAULT_NUM_IMAGES = 1000
+UNKNOWN = 0.0, 0.0  # seconds and MiB of a stage
+DRAWN_FROM_S = 1.0  # a stage that takes less for all numbers of images is left out
+PANELS = (
+    "processor time, s",
+    "largest memory, MiB",
+)  # as the costs of a stage have them
 
 
 def front(random: np.random.Generator) -> materials.Surface:
@@ -247,7 +261,7 @@ def measure(folder: Path, count: int, options: Sequence[str]) -> dict[str, Any]:
         *("--camera-params", parameters, *options),
     ]
     costs_path = folder / "costs-of-run.json"
-    found: dict[str, Any] = {"num_images": count}
+    found: dict[str, Any] = {"num_images": count, "beside_other_work": False}
     for kind, more in (("first", ["--overwrite"]), ("idle", [])):
         own = [
             *(sys.executable, str(Path(__file__).resolve())),
@@ -285,8 +299,89 @@ def rows_of(found: Sequence[dict[str, Any]], kind: str) -> list[list[str]]:
     return rows
 
 
-def main() -> None:
-    """Print the tables."""
+def read_costs(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return what several calls have written to ``costs.json``."""
+    found = []
+    for path in paths:
+        found += json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def by_number(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return costs by rising number of images; the last one counts of those of one number."""
+    last = {one["num_images"]: one for one in found}
+    return [last[count] for count in sorted(last)]
+
+
+def drawn_stages(found: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the stages that take long enough to be seen, in the order of a run."""
+    longest: dict[str, float] = {}
+    for one in found:
+        for stage, (took_s, _) in one["first"].items():
+            longest[stage] = max(longest.get(stage, 0.0), took_s)
+    longest.pop("other", None)
+    return [stage for stage, took_s in longest.items() if took_s >= DRAWN_FROM_S]
+
+
+def points_of(
+    found: Sequence[dict[str, Any]], stage: str, panel: int
+) -> tuple[list[int], list[float]]:
+    """Return numbers of images, and what a stage cost for each, where that is known."""
+    counts = []
+    values = []
+    for one in found:
+        value = one["first"].get(stage, UNKNOWN)[panel]
+        if value > 0.0:
+            counts.append(one["num_images"])
+            values.append(value)
+    return counts, values
+
+
+def guide_line(found: Sequence[dict[str, Any]]) -> tuple[list[int], list[float]]:
+    """Return numbers of images, and a time that grows as n log n from that of the first run."""
+    counts = [one["num_images"] for one in found]
+    total_s = sum(took_s for took_s, _ in found[0]["first"].values())
+    growth = [count * math.log(count) for count in counts]
+    return counts, [total_s * value / growth[0] for value in growth]
+
+
+def draw(found: Sequence[dict[str, Any]], path: Path) -> None:
+    """Draw time and memory of each stage against the number of images.
+
+    Args:
+        found: what :func:`measure` returned, by rising number of images.
+        path: of a picture that is written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 4.4), layout="constrained")
+    counts = [one["num_images"] for one in found]
+    for panel, label in enumerate(PANELS):
+        axes = figure.add_subplot(1, len(PANELS), panel + 1)
+        for stage in drawn_stages(found):
+            axes.plot(*points_of(found, stage, panel), marker="o", label=stage)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xticks(counts, [f"{count:,}" for count in counts])
+        axes.minorticks_off()
+        axes.set_xlabel("images")
+        axes.set_ylabel(label)
+        axes.grid(visible=True, alpha=0.3)
+        for one in found:
+            if one["beside_other_work"]:
+                axes.axvline(one["num_images"], color="gray", linestyle=":")
+    times = figure.axes[0]
+    times.plot(*guide_line(found), color="black", linestyle="--", label="n log n")
+    times.legend(fontsize="small")
+    if any(one["beside_other_work"] for one in found):
+        figure.supxlabel("dotted: measured beside other work", fontsize="small")
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=80)
+
+
+def parsed_arguments() -> Namespace:
+    """Return what the command line says."""
     parser = parser_of(__doc__)
     parser.add_argument(
         "--output-path",
@@ -298,33 +393,75 @@ def main() -> None:
         "--num-images",
         type=int,
         nargs="+",
-        default=[1000],
-        help="numbers of images, each of which is run on",
+        help="numbers of images, each of which is run on; default: 1000, none with --costs-paths",
     )
+    parser.add_argument(
+        "--costs-paths",
+        type=Path,
+        nargs="+",
+        default=[],
+        help="costs.json of other calls, which are shown as well",
+    )
+    parser.add_argument("--diagram-path", type=Path, help="PNG file, by matplotlib")
     parser.add_argument("--measure-run", type=Path, help="JSON file; runs OPTIONS once")
     parser.add_argument(
         "options", nargs="*", help="of run, after --; default: --pairs retrieval"
     )
     arguments = parser.parse_args()
-    if arguments.measure_run:
-        sys.exit(run_measured(arguments.measure_run, arguments.options))
-    photographs = arguments.output_path / "images"
+    if arguments.diagram_path and not find_spec("matplotlib"):
+        raise SystemExit("--diagram-path: needs matplotlib; pip install matplotlib")
+    return arguments
+
+
+def measure_all(
+    folder: Path, counts: Sequence[int], options: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Run on each number of images, and write ``costs.json`` after each.
+
+    Args:
+        folder: of photographs and results.
+        counts: rising numbers of images.
+        options: of ``run``.
+    """
+    photographs = folder / "images"
     photographs.mkdir(parents=True, exist_ok=True)
-    counts = sorted(arguments.num_images)
     take_photographs(photographs, counts[-1])
-    print(describe_machine())
     found = []
     for count in counts:
-        options = arguments.options or ("--pairs", "retrieval")
-        found.append(measure(arguments.output_path, count, options))
-        (arguments.output_path / "costs.json").write_text(
+        found.append(measure(folder, count, options))
+        (folder / "costs.json").write_text(
             json.dumps(found, indent=1), encoding="utf-8"
         )
-    header = ("stage", *[f"{count} images" for count in counts], "growth")
+    return found
+
+
+def print_tables(found: Sequence[dict[str, Any]]) -> None:
+    """Print the costs of first runs, of idle ones where these were measured, and what is right."""
     for kind in ("first", "idle"):
-        print(f"{kind} run\n\n{table(header, rows_of(found, kind))}")
+        known = [one for one in found if kind in one]
+        header = ("stage", *[f"{one['num_images']} images" for one in known], "growth")
+        print(f"{kind} run\n\n{table(header, rows_of(known, kind))}")
     for one in found:
         print(one["scores"])
+
+
+def main() -> None:
+    """Print the tables, and draw the diagram."""
+    arguments = parsed_arguments()
+    if arguments.measure_run:
+        sys.exit(run_measured(arguments.measure_run, arguments.options))
+    # read first: this call may write one of them
+    found = read_costs(arguments.costs_paths)
+    counts = sorted(arguments.num_images or ([] if found else [DEFAULT_NUM_IMAGES]))
+    print(describe_machine())
+    if counts:
+        options = arguments.options or ("--pairs", "retrieval")
+        found += measure_all(arguments.output_path, counts, options)
+    found = by_number(found)
+    print_tables(found)
+    if arguments.diagram_path:
+        arguments.diagram_path.parent.mkdir(parents=True, exist_ok=True)
+        draw(found, arguments.diagram_path)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import cv2
+import many_images
 import numpy as np
 import pytest
 from advice import follow, read_set
@@ -52,17 +53,20 @@ def test_speed_and_complexity_are_measured(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_whole_runs_are_timed_in_turn_and_judged(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
+    pytest.importorskip("distributed")
     result = tmp_path / "new" / "whole.json"
     diagram = tmp_path / "drawn" / "whole.png"
     given = ["--scenes-path", "sample_scenes", "--sets", "courtyard:3"]
-    given += ["--peers", "sift-colmap", "rectified", "--num-rounds", "1"]
+    given += ["--peers", "sift-colmap", "rectified", "rectified+workers"]
+    given += ["--num-rounds", "1"]
     written = ["--output-path", result, "--diagram-path", diagram]
     text = run_script("tests/benchmarks/whole_run.py", *given, *written)
     runs = json.loads(result.read_text())["runs"]
-    assert [run["correct"] for run in runs] == [0, 3]
+    assert [run["correct"] for run in runs] == [0, 3, 3]
     for run in runs:
         assert 0.0 < sum(run["stages_s"].values()) < run["wall_s"]
     assert "| courtyard:3 | 3 | rectified | " in text
+    assert "| courtyard:3 | 3 | rectified+workers | " in text
     assert diagram.read_bytes().startswith(b"\x89PNG")
 
 
@@ -146,3 +150,44 @@ def test_advice_is_followed_by_its_command_and_by_photographs_between(
     assert follow(chosen, command, base, tmp_path)[-1] == "a b"
     marks = {"code": "tie_points", "command": "colmap-affrect run"}
     assert follow(chosen, marks, base, tmp_path) == []
+
+
+def costs_of(count: int, *, alone: bool = True) -> dict[str, object]:
+    """What a call has measured; mapping memory is known by its stage alone."""
+    first = {"match": [count / 10, 300.0], "guide": [0.01, 300.0], "other": [9.0, 0.0]}
+    if count > 50:
+        first["map"] = [count / 5, 2.0 * count]
+    own = {"num_images": count, "beside_other_work": not alone}
+    return own | {"first": first, "scores": f"all of {count}"}
+
+
+def test_costs_of_several_calls_are_ordered_and_small_stages_left_out() -> None:
+    again = costs_of(200) | {"scores": "measured again"}
+    found = many_images.by_number([costs_of(200), costs_of(50), again])
+    assert [one["scores"] for one in found] == ["all of 50", "measured again"]
+    assert many_images.drawn_stages(found) == ["match", "map"]
+    assert many_images.points_of(found, "match", 0) == ([50, 200], [5.0, 20.0])
+    assert many_images.points_of(found, "map", 1) == ([200], [400.0])
+    counts, seconds = many_images.guide_line(found)
+    assert counts == [50, 200]
+    assert seconds[0] == pytest.approx(14.01)
+    growth = 200 * math.log(200) / (50 * math.log(50))
+    assert seconds[1] == pytest.approx(14.01 * growth)
+
+
+def test_costs_of_several_calls_stand_in_one_diagram(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "a.json").write_text(json.dumps([costs_of(50), costs_of(200)]))
+    (tmp_path / "b.json").write_text(json.dumps([costs_of(5000, alone=False)]))
+    diagram = tmp_path / "new" / "many.png"
+    given = ["--output-path", tmp_path, "--diagram-path", diagram, "--costs-paths"]
+    given += [tmp_path / "a.json", tmp_path / "b.json"]
+    monkeypatch.setattr(sys, "argv", ["many_images.py", *map(str, given)])
+    many_images.main()
+    text = capsys.readouterr().out
+    assert "| match | 5.0 s, 300 MiB | 20.0 s, 300 MiB | 500.0 s, 300 MiB |" in text
+    assert "all of 5000" in text
+    assert diagram.read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "images").exists()

@@ -8,9 +8,11 @@ All peers run on a set in turn, in several rounds. Usage:
         --diagram-path out/whole_run.png
 
 A set is a folder below --scenes-path, or SCENE:STEP for every STEP-th photograph of it. Peers are
-`sift-colmap` (pycolmap: extraction, exhaustive matching, incremental mapping, all by default) and
-recipes, whose `run` is timed. Photographs are right as in registration.py, where a scene has a
-folder ground_truth or pseudo_ground_truth. Prints a table of medians, and writes every run as JSON.
+`sift-colmap` (pycolmap: extraction, exhaustive matching, incremental mapping, all by default),
+recipes, whose `run` is timed, and RECIPE+workers: the same on two workers of a cluster on this
+machine, which are started before as docs/cluster.md says, and whose processor time is added.
+Photographs are right as in registration.py, where a scene has a folder ground_truth or
+pseudo_ground_truth. Prints a table of medians, and writes every run as JSON.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from statistics import median
 from typing import Any
 
 from machine import describe_machine, parser_of, span, table
+from workers import started_workers
 
 from colmap_affrect.colmap.model_files import Poses, read_poses
 from colmap_affrect.comparison.results import pose_scores
@@ -39,6 +42,7 @@ from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.recipes import load_recipe
 
 SIFT = "sift-colmap"
+ON_WORKERS = "+workers"
 TRUTHS = ("ground_truth", "pseudo_ground_truth")
 HEADER = (
     "set",
@@ -137,7 +141,8 @@ def command_of(peer: str, image_path: Path, output_path: Path) -> list[str]:
         return [*own, str(image_path), "--output-path", str(output_path)]
     given = ["--image-path", str(image_path), "--output-path", str(output_path)]
     program = [sys.executable, "-m", "colmap_affrect", "run", "--quiet"]
-    return [*program, "--recipe", peer, *given]
+    recipe = peer.removesuffix(ON_WORKERS)
+    return [*program, "--recipe", recipe, *given]
 
 
 def stages_of(output_path: Path) -> dict[str, float]:
@@ -168,10 +173,15 @@ def measure(chosen: Set, peer: str, round_number: int) -> Run:
         output_path = Path(scratch) / "out"
         output_path.mkdir()
         command = command_of(peer, image_path, output_path)
-        begin = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-        wall_s = time.perf_counter() - begin
+        num_workers = 2 if peer.endswith(ON_WORKERS) else 0
+        with started_workers(num_workers, Path(scratch)) as cluster:
+            command += cluster.options
+            idle_s = cluster.processor_s()
+            begin = time.perf_counter()
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+            _, status, usage = os.wait4(process.pid, 0)
+            wall_s = time.perf_counter() - begin
+            workers_s = cluster.processor_s() - idle_s
         code = os.waitstatus_to_exitcode(status)
         # 3 says that photographs are not registered
         if code not in (0, 3):
@@ -188,7 +198,7 @@ def measure(chosen: Set, peer: str, round_number: int) -> Run:
         round=round_number,
         num_images=len(chosen.names),
         wall_s=wall_s,
-        processor_s=usage.ru_utime + usage.ru_stime,
+        processor_s=usage.ru_utime + usage.ru_stime + workers_s,
         memory_mib=usage.ru_maxrss * UNIT_BYTES / MIB,
         stages_s=stages,
         num_models=num_models,
@@ -289,7 +299,7 @@ def check(arguments: Namespace) -> None:
         check_set(text, arguments.scenes_path)
     for peer in set(arguments.peers) - {SIFT}:
         try:
-            load_recipe(peer)
+            load_recipe(peer.removesuffix(ON_WORKERS))
         except OptionError as error:
             raise SystemExit(f"--peers: {error}") from error
     if arguments.diagram_path and not find_spec("matplotlib"):
@@ -317,7 +327,7 @@ def parsed_arguments() -> Namespace:
     )
     parser.add_argument(
         "--peers", nargs="+", default=[SIFT, "default"], metavar="PEER",
-        help=f"{SIFT} or a recipe; the first is the reference of the ratios",
+        help=f"{SIFT}, a recipe, or RECIPE{ON_WORKERS}; the first is the reference of the ratios",
     )  # fmt: skip
     parser.add_argument("--num-rounds", type=int, default=3)
     parser.add_argument("--num-cores", type=int, help="for every peer; by default all")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import signal
 import socket
@@ -15,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -36,6 +38,7 @@ from colmap_affrect.parallel.cluster import (
     require_environment,
 )
 from colmap_affrect.parallel.executor import Executor, Threads
+from colmap_affrect.pipeline import run
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -305,6 +308,42 @@ def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None
         AffrectError, match=r"a\.png is 2 bytes, and 1 bytes on the machine"
     ):
         require_environment(here)
+
+
+def test_a_worker_uses_freed_memory_again_while_it_works_for_a_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = Mock()
+    monkeypatch.setattr(cluster_module, "keep_freed_memory", calls.keep)
+    monkeypatch.setattr(cluster_module, "return_freed_memory", calls.give_back)
+    monkeypatch.setattr(cluster_module, "threadpool_limits", Mock())
+    monkeypatch.setattr(cluster_module.cv2, "setNumThreads", Mock())
+    for _ in range(2):
+        done = cluster_module._work(pickle.dumps(len), (), pickle.dumps(["task"]))
+        assert done.results == [4]
+    cluster_module._forget()
+    assert [name for name, _, _ in calls.mock_calls] == ["keep", "give_back"]
+
+
+def test_torch_is_not_loaded_here_where_workers_match(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads = Mock()
+    monkeypatch.setattr(
+        "colmap_affrect.matchers.nearest.nearest_8bit.load_meanwhile", loads
+    )
+    monkeypatch.setattr(
+        "colmap_affrect.pipeline.extract_features", Mock(side_effect=KeyError)
+    )
+    for executor, num_loads in ((Threads(1), 0), (None, 1)):
+        with pytest.raises(KeyError):
+            run(
+                photos,
+                tmp_path / "out",
+                recipe="unrectified-rootsift",
+                executor=executor,
+            )
+        assert loads.call_count == num_loads
 
 
 WITH_NETWORK = load_recipe("aliked-lightglue", ["matching.max_num_features=120"])

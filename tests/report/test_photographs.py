@@ -14,7 +14,11 @@ from small_run import MORE, NAMES, make_run_page, small_report
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report.observations import ModelReader, registered_images
+from colmap_affrect.report.observations import (
+    ModelReader,
+    Observations,
+    registered_images,
+)
 from colmap_affrect.report.photographs import (
     PhotographReport,
     corner_distortion_px,
@@ -205,6 +209,28 @@ def test_shared_points_are_counted_for_each_pair(workspace: Workspace) -> None:
     for one, two in itertools.combinations(range(len(by_row)), 2):
         assert seen.num_shared[one, two] == len(by_row[one] & by_row[two])
         assert seen.num_shared[two, one] == seen.num_shared[one, two]
+
+
+def test_shared_points_of_many_photographs_are_counted_together() -> None:
+    """More pairs of photographs than observations; a point is seen by up to 30 of them."""
+    random = np.random.default_rng(5)
+    num_images = 60
+    seers = [random.permutation(num_images)[:num] for num in (30, 2, 1, 7, 30)]
+    rows = np.concatenate(seers)
+    ids = np.repeat([7, 3, 9, 1, 4], [len(of_point) for of_point in seers])
+    order = np.lexsort([ids, rows])
+    seen = Observations(
+        names=tuple(map(str, range(num_images))),
+        rows=rows[order],
+        point_ids=ids[order],
+        places=np.zeros((len(rows), 2)),
+        errors_px=np.zeros(len(rows)),
+    )
+    expected = np.zeros((num_images, num_images), np.int64)
+    for of_point in seers:
+        for one, two in itertools.permutations(of_point.tolist(), 2):
+            expected[one, two] += 1
+    np.testing.assert_array_equal(seen.num_shared, expected)
 
 
 QUALITIES_AND_HEADLINES = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
@@ -92,3 +93,23 @@ def test_failure_of_the_database_is_one_line_and_it_is_opened_again(
             add_image(database, "b.png")
             failing()
         assert graph.ids.keys() == {"a.png", "b.png"}
+
+
+def test_inliers_are_counted_without_being_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = ViewGraph(tmp_path / "database.db")
+    with graph.open_to_change() as database:
+        for name in ("b.png", "a.png", "c.png"):
+            add_image(database, name)
+        for pair, count in (((2, 3), 4), ((1, 2), 9), ((1, 3), 0)):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.zeros((count, 2), np.uint32)
+            database.write_two_view_geometry(*pair, geometry)
+    counted = [list(graph.num_inliers(limit).items()) for limit in (1, 4, 5)]
+    assert [len(found) for found in counted] == [2, 2, 1]
+    for limit, found in zip((1, 4, 5), counted, strict=True):
+        read = graph.inliers(limit).items()
+        assert found == [(pair, len(rows)) for pair, rows in read]
+    monkeypatch.setattr("colmap_affrect.session.view_graph._read_num_inliers", None)
+    assert list(graph.num_inliers(1).items()) == counted[0]  # once read, they are there

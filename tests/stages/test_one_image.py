@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import re
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -221,6 +222,31 @@ def test_work_in_another_process_refuses_other_weights(
             AffrectError, match=r"AffNet\.pth: is not the file affnet of"
         ):
             pickle.loads(content)
+
+
+def test_extraction_builds_no_networks_that_only_escalation_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here and in another process; files that are not the published ones are tried at once."""
+    keys = ("affnet", "aliked-n16")
+    files = {key: tmp_path / key for key in keys}
+    for path in files.values():
+        path.write_bytes(b"weights")
+    monkeypatch.setattr(one_image, "resolve", lambda *_, **__: files)
+    monkeypatch.setattr(Resources, "usable_levels", lambda *_: [0, 1, 2])
+    monkeypatch.setattr(one_image, "is_published", lambda *_: True)
+    monkeypatch.setitem(sys.modules, "colmap_affrect.features.networks", None)
+    extraction = load_recipe("default").extraction
+    prepared = prepare(extraction, only_first=True)
+    elsewhere = pickle.loads(pickle.dumps(prepared))
+    for extractor in (prepared, elsewhere):
+        assert [*extractor.extractors] == [*extractor.rectifiers] == [0]
+        assert extractor.weights == files
+    with pytest.raises(ImportError):
+        prepare(extraction)
+    monkeypatch.setattr(one_image, "is_published", lambda key, _: key == "affnet")
+    with pytest.raises(ImportError):
+        prepare(extraction, only_first=True)
 
 
 class ColorOptions(FeatureOptions):

@@ -1,0 +1,160 @@
+"""A command that finds everything done reads neither models nor the rows of the database."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from verified import CAMERAS, copy_of
+
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.tables import rows_digest
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.pipeline import run
+from colmap_affrect.pipeline.single_stages import (
+    map_images,
+    match,
+    verify,
+)
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import photographs as photographs_module
+from colmap_affrect.report.observations import ModelReader
+from colmap_affrect.report.run_report import RunReport
+
+
+@pytest.fixture(scope="module")
+def finished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A run, and a command that has found everything done; nothing may be changed."""
+    path = tmp_path_factory.mktemp("idle") / "out"
+    run(photos, path, recipe="unrectified-rootsift", cameras=CAMERAS, page=False)
+    map_again(Workspace(path))
+    return Workspace(path)
+
+
+def map_again(workspace: Workspace) -> RunReport:
+    return map_images(workspace.path, page=False)
+
+
+@pytest.fixture
+def copy(finished: Workspace, tmp_path: Path) -> Workspace:
+    """A copy, which has other times: it is sealed again."""
+    copied = copy_of(finished, tmp_path / "copy")
+    map_again(copied)
+    return copied
+
+
+def digest_on_record(workspace: Workspace) -> str:
+    return workspace.seal.read_text().splitlines()[0]
+
+
+def test_an_idle_command_reads_neither_models_nor_rows(
+    copy: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = json.loads(copy.report.read_text())
+    monkeypatch.setattr(ModelReader, "model", None)
+    monkeypatch.setattr("colmap_affrect.session.view_graph.rows_digest", None)
+    monkeypatch.setattr("colmap_affrect.session.view_graph._read_inliers", None)
+    report = map_again(copy)
+    assert report.photographs["a.png"].num_points > 30
+    assert len(report.photographs["a.png"].neighbours) == 3
+    after = json.loads(copy.report.read_text())
+    assert after["photographs"] == before["photographs"]
+    assert after["made_from"] == before["made_from"] != ""
+
+
+def edited(workspace: Workspace) -> None:
+    content = json.loads(workspace.report.read_text())
+    content["photographs"]["a.png"]["num_points"] = 1
+    workspace.report.write_text(json.dumps(content))
+
+
+def cut(workspace: Workspace) -> None:
+    workspace.report.write_text(workspace.report.read_text()[:-9])
+
+
+def of_other_versions(workspace: Workspace) -> None:
+    content = json.loads(workspace.report.read_text())
+    content["made_from"] = "of another version"
+    workspace.report.write_text(json.dumps(content))
+
+
+def without_digest(workspace: Workspace) -> None:
+    content = json.loads(workspace.report.read_text())
+    del content["made_from"]
+    workspace.report.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("change", [edited, cut, of_other_versions, without_digest])
+def test_figures_of_a_report_that_is_not_of_these_models_are_counted_again(
+    copy: Workspace, monkeypatch: pytest.MonkeyPatch, change
+) -> None:
+    before = json.loads(copy.report.read_text())
+    counted = list[int]()
+    of_model = photographs_module._of_model
+
+    def count(reader: ModelReader, number: int) -> object:
+        counted.append(number)
+        return of_model(reader, number)
+
+    monkeypatch.setattr(photographs_module, "_of_model", count)
+    change(copy)
+    map_again(copy)
+    assert counted == [0]
+    after = json.loads(copy.report.read_text())
+    assert after["photographs"] == before["photographs"]
+    map_again(copy)
+    assert counted == [0]
+
+
+def test_figures_are_those_of_the_models_of_another_seed(copy: Workspace) -> None:
+    before = json.loads(copy.report.read_text())
+    report = map_images(
+        copy.path, mapping={"random_seed": 5}, overwrite=True, page=False
+    )
+    after = json.loads(copy.report.read_text())
+    assert after["made_from"] != before["made_from"]
+    assert report.photographs["a.png"].num_points > 30
+
+
+def test_each_command_leaves_the_digest_of_the_rows_that_there_are(
+    copy: Workspace,
+) -> None:
+    digests = set()
+    for command in (
+        lambda: map_again(copy),
+        lambda: match(copy.path),
+        lambda: verify(copy.path),
+        lambda: verify(copy.path, {"max_error_px": 2.0}, overwrite=True),
+        lambda: match(copy.path, {"name": "nearest", "max_ratio": 0.7}, overwrite=True),
+        lambda: verify(copy.path, {"max_error_px": 2.0}),
+        lambda: map_again(copy),
+    ):
+        command()
+        digests.add(digest_on_record(copy))
+        assert digest_on_record(copy) == rows_digest(copy.database)
+    assert len(digests) > 2
+
+
+def test_a_seal_that_somebody_has_edited_says_nothing_of_the_rows(
+    copy: Workspace,
+) -> None:
+    digest, *others = copy.seal.read_text().splitlines()
+    copy.seal.write_text("\n".join(["0" * len(digest), *others]))
+    report = map_again(copy)
+    assert report.stages[-1].num_kept == 1  # models stay
+    assert digest_on_record(copy) == digest == rows_digest(copy.database)
+
+
+def test_a_command_that_fails_leaves_the_digest_of_what_it_has_changed(
+    copy: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        with open_database(copy.database) as database:
+            database.clear_two_view_geometries()
+        raise AffrectError("no more")
+
+    monkeypatch.setattr("colmap_affrect.pipeline.single_stages.verify_pairs", failing)
+    with pytest.raises(AffrectError, match="no more"):
+        verify(copy.path)
+    assert digest_on_record(copy) == rows_digest(copy.database)
