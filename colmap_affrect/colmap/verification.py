@@ -11,7 +11,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import (
     Cameras,
     Keypoints,
-    pair_model,
     significance,
     telling_shapes,
 )
@@ -36,15 +35,11 @@ NUM_TRIALS_OF_NOTHING = 100
 # COLMAP's is 3. With 1, 361 right pairs of seven scenes are verified as before, with 99.95 per
 # cent of their right inliers, in 0.8 of the time; measured
 TRIALS_PER_NEEDED_TRIAL = 1.0
-# The same for a pair of few inliers, among the matches that the geometry found so far nearly
-# explains. A sample without wrong matches is not yet an exact one, and few inliers do not make up
-# for that: of 332 such pairs of four scenes 54 per cent have rotations within 10 degrees after one
-# search of all matches, 56 with three times the samples, 63 after both searches, which take 0.46
-# of the time of these; measured
-TRIALS_OF_FEW_INLIERS = 10.0
+# COLMAP's. A sample without wrong matches is not yet an exact one, and few inliers do not make up
+# for that: of 40 pairs with fewer than 60 it finds 0.7 per cent more of the right matches, of 66
+# with more 0.03 per cent; measured
+TRIALS_OF_FEW_INLIERS = 3.0
 MAX_FEW_INLIERS = 60  # measured
-# Times the largest error of an inlier, of matches that are searched again; measured
-NEARLY_EXPLAINED = 10.0
 # Largest of the shares of inliers that samples must suffice for: by it a hundred homographies
 # are drawn, the fewest that COLMAP draws for any pair; theory
 MAX_LEAST_SHARE = 0.5
@@ -157,111 +152,56 @@ def _significant_geometry(
 
     Its inliers are rows, twice. None where there are too few of them, or chance made them.
     """
-    judge = _Judge(cameras, keypoints, options)
-    geometry = _searched_geometry(cameras, keypoints, options)
-    if geometry is None or not judge.has_enough_inliers(geometry):
-        return None
-    if judge.is_chance(geometry):
-        points = (_positions(keypoints[0]), _positions(keypoints[1]))
-        planar = _planar_geometry(geometry, points, options)
-        return planar if judge.accepts(planar) else None
-    if len(geometry.inlier_matches) >= MAX_FEW_INLIERS or not options.min_significance:
+    search = _search_options(keypoints, options)
+    geometry = _searched_geometry(cameras, keypoints, options, search)
+    if geometry is None or not options.min_significance:
         return geometry
-    found = _searched_again(geometry, cameras, keypoints, options)
-    return found if found and judge.accepts(found) else geometry
-
-
-@dataclass(frozen=True)
-class _Judge:
-    """Judges geometries by all matches of a pair, whatever they were found in."""
-
-    cameras: Cameras
-    keypoints: Keypoints
-    options: VerificationOptions
-
-    def accepts(self, geometry: pycolmap.TwoViewGeometry) -> bool:
-        """Tell whether a geometry has enough inliers, and chance did not make them."""
-        return self.has_enough_inliers(geometry) and not self.is_chance(geometry)
-
-    def has_enough_inliers(self, geometry: pycolmap.TwoViewGeometry) -> bool:
-        """Tell whether a geometry has as many inliers as a pair is verified with."""
-        least = self.options.min_inlier_ratio * len(self.keypoints[0])
-        num_inliers = len(geometry.inlier_matches)
-        return num_inliers >= max(self.options.min_num_inliers, least)
-
-    def is_chance(self, geometry: pycolmap.TwoViewGeometry) -> bool:
-        """Tell whether chance would make such a geometry now and then; never where all count."""
-        if not self.options.min_significance:
-            return False
-        of_chance = significance(
-            geometry, self.cameras, self.keypoints, self.options.max_error_px
-        )
-        return of_chance < self.options.min_significance
+    if len(geometry.inlier_matches) >= MAX_FEW_INLIERS:
+        return geometry
+    # With a seed: the same samples, and others after them
+    search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
+    return _searched_geometry(cameras, keypoints, options, search) or geometry
 
 
 def _searched_geometry(
     cameras: Cameras,
     keypoints: Keypoints,
     options: VerificationOptions,
-    times_needed: float = TRIALS_PER_NEEDED_TRIAL,
+    search: pycolmap.TwoViewGeometryOptions,
 ) -> pycolmap.TwoViewGeometry | None:
-    """Return what a search of matches finds, with rows as inliers; None where that is nothing."""
-    rows = _twice(np.arange(len(keypoints[0]), dtype=np.uint32))
+    """Return what one search finds, as :func:`_significant_geometry` does."""
+    num_matches = len(keypoints[0])
+    rows = _twice(np.arange(num_matches, dtype=np.uint32))
+    points = (_positions(keypoints[0]), _positions(keypoints[1]))
     geometry = pycolmap.estimate_two_view_geometry(
-        cameras[0],
-        _positions(keypoints[0]),
-        cameras[1],
-        _positions(keypoints[1]),
-        rows,
-        _search_options(keypoints, options, times_needed),
+        cameras[0], points[0], cameras[1], points[1], rows, search
+    )
+    min_num_inliers = max(
+        options.min_num_inliers, options.min_inlier_ratio * num_matches
     )
     # Of a geometry that it rejects the estimator returns the inliers all the same.
-    return None if geometry.config in REJECTED else geometry
+    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
+        return None
 
+    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
+        of_chance = significance(found, cameras, keypoints, options.max_error_px)
+        return of_chance < options.min_significance
 
-def _searched_again(
-    geometry: pycolmap.TwoViewGeometry,
-    cameras: Cameras,
-    keypoints: Keypoints,
-    options: VerificationOptions,
-) -> pycolmap.TwoViewGeometry | None:
-    """Return the geometry of the matches that a geometry of few inliers nearly explains.
-
-    Args:
-        geometry: what a search of all matches has found.
-        cameras: of the two images.
-        keypoints: of all matches.
-        options: of verification.
-    """
-    with np.errstate(all="ignore"):  # of points that a camera cannot undistort
-        model = pair_model(geometry, cameras, keypoints)
-        if model is None:
-            return None
-        every = np.arange(len(keypoints[0]))
-        errors = model.errors(every, every)
-    rows = np.flatnonzero(errors <= NEARLY_EXPLAINED * options.max_error_px)
-    nearly_explained = (keypoints[0][rows], keypoints[1][rows])
-    found = _searched_geometry(
-        cameras, nearly_explained, options, TRIALS_OF_FEW_INLIERS
-    )
-    if found is not None:
-        inliers = rows[np.asarray(found.inlier_matches, np.int64)[:, 0]]
-        found.inlier_matches = _twice(inliers.astype(np.uint32))
-    return found
+    if not options.min_significance or not is_chance(geometry):
+        return geometry
+    planar = _planar_geometry(geometry, points, options)
+    if len(planar.inlier_matches) < min_num_inliers or is_chance(planar):
+        return None
+    return planar
 
 
 def _search_options(
-    keypoints: Keypoints, options: VerificationOptions, times_needed: float
+    keypoints: Keypoints, options: VerificationOptions
 ) -> pycolmap.TwoViewGeometryOptions:
     """Return pycolmap's options for a pair, so that the search ends when it is sure enough.
 
     COLMAP draws several times as many samples as its confidence asks for, and those of few
     matches for a smaller share of inliers than any pair is verified with.
-
-    Args:
-        keypoints: of the matches.
-        options: of verification.
-        times_needed: how many times as many samples are drawn as the confidence asks for.
     """
     num_matches = len(keypoints[0])
     search = two_view_options(_without_vain_trials(keypoints, options))
@@ -270,7 +210,7 @@ def _search_options(
         search.ransac.min_inlier_ratio = max(
             search.ransac.min_inlier_ratio, least_share
         )
-        search.ransac.dyn_num_trials_multiplier = times_needed
+        search.ransac.dyn_num_trials_multiplier = TRIALS_PER_NEEDED_TRIAL
     return search
 
 

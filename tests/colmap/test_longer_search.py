@@ -64,7 +64,7 @@ def verified(pair: tuple[Side, Side], **options: Any) -> NDArray[np.int64]:
 
 @pytest.mark.parametrize("scene", [0, 5])
 def test_few_right_matches_are_found_whatever_is_drawn_first(scene: int) -> None:
-    """One search alone misses five or six of thirty with some seeds."""
+    """With a third of the samples some seeds miss five or six of thirty."""
     num_right = 30
     pair = sides(num_right, num_wrong=30, seed=scene)
     for seed in range(12):
@@ -73,7 +73,7 @@ def test_few_right_matches_are_found_whatever_is_drawn_first(scene: int) -> None
 
 
 @pytest.mark.parametrize(("num_right", "num_wrong", "multipliers"), [
-    (30, 30, [1.0, 10.0]),
+    (30, 30, [1.0, 3.0]),
     (MAX_FEW_INLIERS + 40, 30, [1.0]),  # many make an exact geometry
     (0, 60, [1.0]),  # nothing is verified
 ])  # fmt: skip
@@ -108,25 +108,3 @@ def test_what_is_accepted_as_colmap_does_is_searched_once(
     monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", recorded)
     verified(sides(30, 30, seed=0), min_significance=0)
     assert len(asked) == 1
-
-
-def test_only_what_is_nearly_explained_is_searched_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of matches that are wrong anywhere in the image a few are near their epipolar line."""
-    nums = list[int]()
-    estimate = pycolmap.estimate_two_view_geometry
-
-    def recorded(*given: Any) -> pycolmap.TwoViewGeometry:
-        nums.append(len(given[1]))
-        return estimate(*given)
-
-    monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", recorded)
-    pair = sides(num_right=30, num_wrong=40, seed=0)
-    # Wrong ones first, so that rows of what is searched again are not those of all
-    turned = [Side(side.camera, side.keypoints[::-1].copy()) for side in pair]
-    kept = verified((turned[0], turned[1]))
-    assert nums[0] == 70
-    assert 30 <= nums[1] <= 55
-    assert np.count_nonzero(kept >= 40) >= 28
-    assert np.count_nonzero(kept < 40) <= 5
