@@ -97,9 +97,11 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
             _map_copy(context, mapper, choice, new)
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
-    is_sure = bool(found) and names.issubset(found[0].sure)
     learned_models = LearnedModels(
-        _set_of(context), num_right_poses(found), is_sure, num_right_poses_now(context)
+        of_set=_set_of(context),
+        score=num_right_poses(found),
+        score_without=num_right_poses_now(context),
+        is_of_most=2.0 * num_right_poses(found[:1]) > len(names) - 1,
     )
     context.matches.update_state(learned_models=learned_models)
 

@@ -67,7 +67,7 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
 ) -> None:
     context = context_in(tmp_path)
     of_set = _set_of(context)
-    learned = LearnedModels(of_set, score=3.0, is_sure=False, score_without=1.0)
+    learned = LearnedModels(of_set, score=3.0, score_without=1.0)
     context.matches.state = MatchState(listed="pairs", learned_models=learned)
     let_models_have(now, monkeypatch)
     assert needs_learned_models(context) == is_needed
@@ -76,10 +76,15 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
 
 
 @pytest.mark.parametrize(
-    ("sure", "is_sure"), [(["a", "b", "c"], True), (["a", "b"], False), ([], False)]
+    ("probabilities", "is_of_most"),
+    [([0.7], True), ([0.65], False), ([0.6, 0.6], False), ([], False)],
 )
-def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
-    sure: list[str], *, is_sure: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_one_model_of_learned_matches_has_most_poses_right_or_none_has(
+    probabilities: list[float],
+    *,
+    is_of_most: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     context = context_in(tmp_path)
     context.by_hand.left_out = ()
@@ -89,8 +94,11 @@ def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
         recorded.append(learned_models)
 
     context.matches.update_state = update_state
-    model = SimpleNamespace(sure=sure, probabilities=dict.fromkeys(NAMES, 0.9))
-    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [model])
+    models = []
+    for probability in probabilities:
+        model = SimpleNamespace(probabilities=dict.fromkeys(NAMES, probability))
+        models.append(model)
+    monkeypatch.setattr(alternatives, "read_summaries", lambda _: models)
     monkeypatch.setattr(
         alternatives, "_choice_of_learned_matches", lambda _: Choice((), {})
     )
@@ -99,8 +107,9 @@ def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
     mapper: Any = None
     map_learned_matches(escalation, mapper)
     (found,) = recorded
-    assert found.is_sure == is_sure
-    assert found.score == pytest.approx(3 * 0.9 - 1.0)
+    assert found.is_of_most == is_of_most
+    expected = sum(3 * probability - 1.0 for probability in probabilities)
+    assert found.score == pytest.approx(expected)
     assert found.score_without == 1.2
 
 
