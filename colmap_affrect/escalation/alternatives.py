@@ -28,7 +28,11 @@ from colmap_affrect.mappers.mapping import (
 from colmap_affrect.mappers.wrong_models import copy_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.match_state import LearnedModels, Worth
+from colmap_affrect.project.match_state import (
+    NOTHING_TO_GO_ON_FROM,
+    LearnedModels,
+    Worth,
+)
 from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.report import ModelSummary, expected_right_poses
@@ -103,6 +107,18 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
         score_without=num_right_poses_now(context),
         is_of_most=2.0 * num_right_poses(found[:1]) > len(names) - 1,
     )
+    context.matches.update_state(learned_models=learned_models)
+
+
+def has_models_to_go_on_from(context: Context) -> bool:
+    """Return whether any relative pose of the models that are there is expected to be right."""
+    return num_right_poses_now(context) >= NOTHING_TO_GO_ON_FROM
+
+
+def give_up_learned_models(context: Context) -> None:
+    """Put on record that there are no models of learned matches: they are expected to be worse."""
+    score_without = num_right_poses_now(context)
+    learned_models = LearnedModels(_set_of(context), 0.0, score_without)
     context.matches.update_state(learned_models=learned_models)
 
 

@@ -348,14 +348,19 @@ class Escalation:
             )
         return bool(step.pairs)
 
-    def match_learned(self) -> int:
+    def match_learned(self, *, only_verified: bool = False) -> int:
         """Match the pairs of :meth:`plan_learned_matching` that have no learned matches yet.
+
+        Args:
+            only_verified: leave those that are not verified.
 
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
         """
         planned = self.matches.state.learned_matching or Begun(0, ())
         pairs = self._allowed(planned.pairs)
+        if only_verified:
+            pairs = [*self._verified_of(pairs)]
         done = self.matches.learned_levels(pairs)
         todo = [pair for pair in pairs if done[pair] < 0]
         num_matched = 0
@@ -367,6 +372,28 @@ class Escalation:
             num_matched += len(batch)
         self.write()  # the features are keypoints of the database, too
         return num_matched
+
+    @property
+    def ties_verified_pairs_no_better(self) -> bool:
+        """Whether learned matches have more inliers for no more than half of the verified pairs.
+
+        Of those that :meth:`plan_learned_matching` has. It is not known before all of these have
+        learned matches.
+        """
+        planned = self.matches.state.learned_matching or Begun(0, ())
+        verified = self._verified_of(self._allowed(planned.pairs))
+        learned = self.matches.learned([*verified])
+        if not verified or len(learned) < len(verified):
+            return False
+        num_better = 0
+        for pair, one in learned.items():
+            num_better += one.worth[0] > verified[pair]
+        return 2 * num_better <= len(verified)
+
+    def _verified_of(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """Return those of some pairs that are verified, with their inliers."""
+        num_inliers = self.image_set.num_inliers()
+        return {pair: num_inliers[pair] for pair in pairs if num_inliers.get(pair)}
 
     @property
     def has_all_learned_matches(self) -> bool:

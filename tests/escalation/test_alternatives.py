@@ -462,6 +462,7 @@ def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
         return weights(state, models) or dict.fromkeys(NAMES, 1e-3)
 
     monkeypatch.setattr(ImageSet, "weights", unsure)
+    monkeypatch.setattr(map_and_rematch, "has_models_to_go_on_from", lambda _: False)
     workspace = verified(photos, tmp_path / "out", recipe.name)
     context = Context(workspace)
     with workspace.locked():
@@ -493,6 +494,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
     """Mapping their matches a second time might end elsewhere."""
     spaces = [copy_of(matched, tmp_path / name) for name in ("whole", "killed")]
     monkeypatch.setattr(LearnedModels, "is_enough", True)
+    monkeypatch.setattr(map_and_rematch, "has_models_to_go_on_from", lambda _: False)
     monkeypatch.setattr(ImageSet, "weights", lambda *_: {NAMES[0]: 1.0})
     monkeypatch.setattr(Escalation, "next_step", lambda _: None)
     whole, killed = (Context(space) for space in spaces)
