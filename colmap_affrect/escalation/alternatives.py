@@ -285,6 +285,11 @@ def num_right_poses_of_best(context: Context) -> float:
         return 0.0
 
 
+def has_become_worse(context: Context) -> bool:
+    """Return whether the models that are there are worse than the best ones so far."""
+    return num_right_poses_of_best(context) > num_right_poses_now(context)
+
+
 def restore_best(escalation: Escalation) -> bool:
     """Go back to the best models so far, and to their matches, if those that are there are worse.
 
@@ -293,7 +298,7 @@ def restore_best(escalation: Escalation) -> bool:
     """
     context = escalation.context
     best = context.workspace.best
-    if num_right_poses_of_best(context) <= num_right_poses_now(context):
+    if not has_become_worse(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
     pairs = list(escalation.image_set.num_inliers())

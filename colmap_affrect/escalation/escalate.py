@@ -188,17 +188,20 @@ class Escalation:
         """Whether the time that the user gave is over."""
         return time.monotonic() > self.context.deadline_s
 
-    def next_step(self) -> Step | None:
+    def next_step(self, *, may_cost: bool = True) -> Step | None:
         """Return a level, and the pairs to match at it now; None when nothing is left to do.
 
         No pairs are left where a killed run has matched all of a step, but for the database.
+
+        Args:
+            may_cost: otherwise only matches that are there already are used.
         """
         if self.is_over_time:
             return None
         begun = self.matches.state.step
         if begun:
             return Step(begun.level, self._left_of(begun))
-        plan = self._plan()
+        plan = self._plan(may_cost=may_cost)
         self.left_s = plan.left_s / available_cores()
         self.context.progress.expect(self.left_s)
         return plan.step if plan.step.pairs else None
@@ -213,26 +216,30 @@ class Escalation:
                 left.append(pair)
         return left
 
-    def _plan(self) -> Plan:
+    def _plan(self, *, may_cost: bool) -> Plan:
         models = self.image_set.models()
         weights = self.image_set.weights(models)
         if not weights:
             return Plan()
-        return next_step(self.image_set.situation(weights, models), self.context.effort)
+        situation = self.image_set.situation(weights, models)
+        return next_step(situation, self.context.effort, may_cost=may_cost)
 
-    def take_steps(self, before_each: Callable[[], None] = lambda: None) -> None:
+    def take_steps(
+        self, before_each: Callable[[], None] = lambda: None, *, may_cost: bool = True
+    ) -> None:
         """Take steps until none is left.
 
         Args:
             before_each: called before each step.
+            may_cost: otherwise only matches that are there already are used.
         """
-        step = self.next_step()
+        step = self.next_step(may_cost=may_cost)
         while step:
             before_each()
             start = time.perf_counter()
             self.match_at(step.pairs, step.level)
             self.add_to_report(time.perf_counter() - start, len(step.pairs))
-            step = self.next_step()
+            step = self.next_step(may_cost=may_cost)
 
     def add_to_report(self, seconds: float, num_pairs: int) -> None:
         """Count what was done.

@@ -12,6 +12,7 @@ from colmap_affrect.escalation.alternatives import (
     adopt_chosen_models,
     choose_learned,
     give_up_learned_models,
+    has_become_worse,
     has_models_to_go_on_from,
     keep_best,
     map_learned_matches,
@@ -55,7 +56,10 @@ def map_and_rematch(
         update_keypoints_of_models(context)
     is_unfinished = True
     while is_unfinished:
-        escalation.take_steps(before_each=partial(keep_best, context))
+        # What made models worse has cost enough.
+        escalation.take_steps(
+            partial(keep_best, context), may_cost=not has_become_worse(context)
+        )
         before = context.workspace.model_inputs()
         reports += _map_on(context, mapper, recipe)
         # Nothing changes where no pair makes a model, or all are mapped.

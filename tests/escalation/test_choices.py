@@ -404,6 +404,41 @@ def test_learned_matches_that_tie_verified_pairs_no_better_are_given_up(
     assert found == [*done, num_pairs]
 
 
+def test_steps_cost_nothing_while_models_are_worse_than_the_best_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first steps made them worse; after those that follow the best ones come back."""
+    found = list[bool]()
+
+    def take_steps(_: Any, *, may_cost: bool) -> None:
+        found.append(may_cost)
+
+    inputs = iter(("first", "second", "second", "second", "second", "second"))
+    is_worse = iter((False, True, False))
+    escalation: Any = SimpleNamespace(
+        has_stepped=True, take_steps=take_steps, final_report=lambda: None
+    )
+    patches = {
+        "begin": lambda *_: escalation,
+        "adopt_chosen_models": lambda _: None,
+        "_map_first": lambda *_: [],
+        "_try_learned_matches": lambda *_: None,
+        "choose_learned": lambda *_, **__: False,
+        "has_become_worse": lambda _: next(is_worse),
+        "_map_on": lambda *_: [],
+        "restore_best": lambda _: len(found) == 2,
+        "remove_alternatives": lambda _: None,
+    }
+    for name, function in patches.items():
+        monkeypatch.setattr(map_and_rematch, name, function)
+    workspace = SimpleNamespace(model_inputs=lambda: next(inputs))
+    context: Any = SimpleNamespace(workspace=workspace)
+    recipe: Any = SimpleNamespace(escalate=None)
+    mapper: Any = None
+    map_and_rematch.map_and_rematch(context, mapper, recipe)
+    assert found == [True, False, True]
+
+
 def test_learned_models_that_were_given_up_are_needed_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
