@@ -169,6 +169,15 @@ class Situation:
         has_all = not self.pairs_without_learned_matches()
         return number == self.learned_level and has_all
 
+    def levels_worth_trying(self, *, may_cost: bool) -> list[int]:
+        """Return the usable levels that cost nothing, or may cost and were not in vain."""
+        found = list[int]()
+        for number in self.usable:
+            may_help = may_cost and not self.is_in_vain(number)
+            if may_help or self.costs_nothing(number):
+                found.append(number)
+        return found
+
     @property
     def first_model_s(self) -> float:
         """Nominal seconds of all that comes before escalation."""
@@ -355,11 +364,10 @@ def next_step(
         if learned.pairs:
             return Plan(learned, max(0.0, left_s) + situation.first_model_s)
     hopeful = list[Step]()
-    for number in situation.usable:
-        costs_in_vain = not may_cost or situation.is_in_vain(number)
-        gives_up = EFFORTS[effort].gives_up and not situation.costs_nothing(number)
-        if costs_in_vain and gives_up:
-            continue
+    numbers = situation.usable
+    if EFFORTS[effort].gives_up:
+        numbers = situation.levels_worth_trying(may_cost=may_cost)
+    for number in numbers:
         step = situation.best_step(number, left_s)
         if is_hopeful(step, situation):
             hopeful.append(step)
