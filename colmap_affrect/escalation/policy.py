@@ -6,7 +6,7 @@
    many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
-   nothing is likely to help.
+   nothing is likely to help. Levels that were in vain are given up, but with high effort.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
 as any other.
