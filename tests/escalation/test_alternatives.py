@@ -496,7 +496,7 @@ def test_chosen_models_are_those_that_were_looked_at_also_when_killed_after_the_
     monkeypatch.setattr(LearnedModels, "is_enough", True)
     monkeypatch.setattr(map_and_rematch, "has_models_to_go_on_from", lambda _: False)
     monkeypatch.setattr(ImageSet, "weights", lambda *_: {NAMES[0]: 1.0})
-    monkeypatch.setattr(Escalation, "next_step", lambda _: None)
+    monkeypatch.setattr(Escalation, "next_step", lambda *_, **__: None)
     whole, killed = (Context(space) for space in spaces)
     map_and_rematch.map_and_rematch(whole, mapper, recipe)
     with monkeypatch.context() as patch:
