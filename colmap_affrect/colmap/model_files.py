@@ -449,6 +449,10 @@ def all_see_long_tracks(
         least: number of such points that each of them must see.
     """
     missing = dict.fromkeys(image_ids, least)
+    for image_id in missing:
+        # As often in hard sets: it is known without going through all points.
+        if model.images[image_id].num_points3D < least:
+            return False
     for track in _long_tracks(model):
         for image_id in track & missing.keys():
             missing[image_id] -= 1

@@ -28,7 +28,11 @@ from colmap_affrect.mappers.mapping import (
 from colmap_affrect.mappers.wrong_models import copy_thrown_away
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.atomic_files import cannot_write
-from colmap_affrect.project.match_state import LearnedModels, Worth
+from colmap_affrect.project.match_state import (
+    NOTHING_TO_GO_ON_FROM,
+    LearnedModels,
+    Worth,
+)
 from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.project.outputs import remove_own, temporary_folder
 from colmap_affrect.project.report import ModelSummary, expected_right_poses
@@ -97,10 +101,24 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
             _map_copy(context, mapper, choice, new)
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
-    is_sure = bool(found) and names.issubset(found[0].sure)
     learned_models = LearnedModels(
-        _set_of(context), num_right_poses(found), is_sure, num_right_poses_now(context)
+        of_set=_set_of(context),
+        score=num_right_poses(found),
+        score_without=num_right_poses_now(context),
+        is_of_most=2.0 * num_right_poses(found[:1]) > len(names) - 1,
     )
+    context.matches.update_state(learned_models=learned_models)
+
+
+def has_models_to_go_on_from(context: Context) -> bool:
+    """Return whether any relative pose of the models that are there is expected to be right."""
+    return num_right_poses_now(context) >= NOTHING_TO_GO_ON_FROM
+
+
+def give_up_learned_models(context: Context) -> None:
+    """Put on record that there are no models of learned matches: they are expected to be worse."""
+    score_without = num_right_poses_now(context)
+    learned_models = LearnedModels(_set_of(context), 0.0, score_without)
     context.matches.update_state(learned_models=learned_models)
 
 
@@ -267,6 +285,11 @@ def num_right_poses_of_best(context: Context) -> float:
         return 0.0
 
 
+def has_become_worse(context: Context) -> bool:
+    """Return whether the models that are there are worse than the best ones so far."""
+    return num_right_poses_of_best(context) > num_right_poses_now(context)
+
+
 def restore_best(escalation: Escalation) -> bool:
     """Go back to the best models so far, and to their matches, if those that are there are worse.
 
@@ -275,7 +298,7 @@ def restore_best(escalation: Escalation) -> bool:
     """
     context = escalation.context
     best = context.workspace.best
-    if num_right_poses_of_best(context) <= num_right_poses_now(context):
+    if not has_become_worse(context):
         return False
     before = MatchStore(best / context.workspace.matches.name)
     pairs = list(escalation.image_set.num_inliers())

@@ -188,17 +188,20 @@ class Escalation:
         """Whether the time that the user gave is over."""
         return time.monotonic() > self.context.deadline_s
 
-    def next_step(self) -> Step | None:
+    def next_step(self, *, may_cost: bool = True) -> Step | None:
         """Return a level, and the pairs to match at it now; None when nothing is left to do.
 
         No pairs are left where a killed run has matched all of a step, but for the database.
+
+        Args:
+            may_cost: otherwise only matches that are there already are used.
         """
         if self.is_over_time:
             return None
         begun = self.matches.state.step
         if begun:
             return Step(begun.level, self._left_of(begun))
-        plan = self._plan()
+        plan = self._plan(may_cost=may_cost)
         self.left_s = plan.left_s / available_cores()
         self.context.progress.expect(self.left_s)
         return plan.step if plan.step.pairs else None
@@ -213,26 +216,30 @@ class Escalation:
                 left.append(pair)
         return left
 
-    def _plan(self) -> Plan:
+    def _plan(self, *, may_cost: bool) -> Plan:
         models = self.image_set.models()
         weights = self.image_set.weights(models)
         if not weights:
             return Plan()
-        return next_step(self.image_set.situation(weights, models), self.context.effort)
+        situation = self.image_set.situation(weights, models)
+        return next_step(situation, self.context.effort, may_cost=may_cost)
 
-    def take_steps(self, before_each: Callable[[], None] = lambda: None) -> None:
+    def take_steps(
+        self, before_each: Callable[[], None] = lambda: None, *, may_cost: bool = True
+    ) -> None:
         """Take steps until none is left.
 
         Args:
             before_each: called before each step.
+            may_cost: otherwise only matches that are there already are used.
         """
-        step = self.next_step()
+        step = self.next_step(may_cost=may_cost)
         while step:
             before_each()
             start = time.perf_counter()
             self.match_at(step.pairs, step.level)
             self.add_to_report(time.perf_counter() - start, len(step.pairs))
-            step = self.next_step()
+            step = self.next_step(may_cost=may_cost)
 
     def add_to_report(self, seconds: float, num_pairs: int) -> None:
         """Count what was done.
@@ -348,14 +355,19 @@ class Escalation:
             )
         return bool(step.pairs)
 
-    def match_learned(self) -> int:
+    def match_learned(self, *, only_verified: bool = False) -> int:
         """Match the pairs of :meth:`plan_learned_matching` that have no learned matches yet.
+
+        Args:
+            only_verified: leave those that are not verified.
 
         Returns:
             How many were matched; some may be left where the time that the user gave is over.
         """
         planned = self.matches.state.learned_matching or Begun(0, ())
         pairs = self._allowed(planned.pairs)
+        if only_verified:
+            pairs = [*self._verified_of(pairs)]
         done = self.matches.learned_levels(pairs)
         todo = [pair for pair in pairs if done[pair] < 0]
         num_matched = 0
@@ -367,6 +379,28 @@ class Escalation:
             num_matched += len(batch)
         self.write()  # the features are keypoints of the database, too
         return num_matched
+
+    @property
+    def ties_verified_pairs_no_better(self) -> bool:
+        """Whether learned matches have more inliers for no more than half of the verified pairs.
+
+        Of those that :meth:`plan_learned_matching` has. It is not known before all of these have
+        learned matches.
+        """
+        planned = self.matches.state.learned_matching or Begun(0, ())
+        verified = self._verified_of(self._allowed(planned.pairs))
+        learned = self.matches.learned([*verified])
+        if not verified or len(learned) < len(verified):
+            return False
+        num_better = 0
+        for pair, one in learned.items():
+            num_better += one.worth[0] > verified[pair]
+        return 2 * num_better <= len(verified)
+
+    def _verified_of(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """Return those of some pairs that are verified, with their inliers."""
+        num_inliers = self.image_set.num_inliers()
+        return {pair: num_inliers[pair] for pair in pairs if num_inliers.get(pair)}
 
     @property
     def has_all_learned_matches(self) -> bool:

@@ -11,6 +11,9 @@ from functools import partial
 from colmap_affrect.escalation.alternatives import (
     adopt_chosen_models,
     choose_learned,
+    give_up_learned_models,
+    has_become_worse,
+    has_models_to_go_on_from,
     keep_best,
     map_learned_matches,
     needs_learned_models,
@@ -53,7 +56,10 @@ def map_and_rematch(
         update_keypoints_of_models(context)
     is_unfinished = True
     while is_unfinished:
-        escalation.take_steps(before_each=partial(keep_best, context))
+        # What made models worse has cost enough.
+        escalation.take_steps(
+            partial(keep_best, context), may_cost=not has_become_worse(context)
+        )
         before = context.workspace.model_inputs()
         reports += _map_on(context, mapper, recipe)
         # Nothing changes where no pair makes a model, or all are mapped.
@@ -68,14 +74,26 @@ def map_and_rematch(
 
 
 def _try_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
-    """Match pairs of a small set by learned matching, once, and map with these matches alone."""
+    """Match pairs of a small set by learned matching, once, and map with these matches alone.
+
+    The pairs that measured frames verify come first where there is something to go on from: models
+    of learned matches are not likely to be better unless these tie most of them better. If not,
+    learned matching is a level as any other.
+    """
     context = escalation.context
     if not needs_learned_models(context) or not escalation.plan_learned_matching():
         return
     start = time.perf_counter()
-    num_matched = escalation.match_learned()
-    if escalation.has_all_learned_matches:
-        map_learned_matches(escalation, mapper)
+    num_matched = 0
+    may_be_in_vain = has_models_to_go_on_from(context)
+    if may_be_in_vain:
+        num_matched += escalation.match_learned(only_verified=True)
+    if may_be_in_vain and escalation.ties_verified_pairs_no_better:
+        give_up_learned_models(context)
+    else:
+        num_matched += escalation.match_learned()
+        if escalation.has_all_learned_matches:
+            map_learned_matches(escalation, mapper)
     escalation.add_to_report(time.perf_counter() - start, num_matched)
 
 

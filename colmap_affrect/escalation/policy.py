@@ -6,7 +6,7 @@
    many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
-   nothing is likely to help.
+   nothing is likely to help. Levels that were in vain are given up, but with high effort.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
 as any other.
@@ -48,11 +48,13 @@ class Effort:
         least_s: even if the first model took less.
         times_first_model: of what the first model took, where that is more.
         without_model_s: while nothing is registered.
+        gives_up: levels that were in vain, and all that costs while models have become worse.
     """
 
     least_s: float
     times_first_model: float
     without_model_s: float
+    gives_up: bool = True
 
     def budget_s(self, first_model_s: float, *, has_model: bool) -> float:
         """Return what levels after learned matching may take.
@@ -72,7 +74,9 @@ class Effort:
 EFFORTS: Mapping[EffortName, Effort] = {
     "low": Effort(least_s=0.0, times_first_model=0.0, without_model_s=0.0),
     "normal": Effort(least_s=120.0, times_first_model=1.0, without_model_s=900.0),
-    "high": Effort(least_s=600.0, times_first_model=5.0, without_model_s=3600.0),
+    "high": Effort(
+        least_s=600.0, times_first_model=5.0, without_model_s=3600.0, gives_up=False
+    ),
 }
 
 
@@ -146,6 +150,33 @@ class Situation:
         image_sizes = [sizes[name] for name in names]
         pair_sizes = [(sizes[first], sizes[second]) for first, second in pairs]
         return statistics_of(self.levels[number]).seconds(image_sizes, pair_sizes)
+
+    def is_in_vain(self, number: int) -> bool:
+        """Tell whether a level was tried for a small set, and not one pair uses its matches.
+
+        These were worse, or models with them were, which have been gone back from. While nothing is
+        registered, nothing is known of that. The pairs that promised most were tried first.
+        """
+        has_been_tried = False
+        for state in self.states.values():
+            if state.level == number:
+                return False
+            has_been_tried |= bool(state.tried >> number & 1)
+        return has_been_tried and self.is_small and bool(self.registered)
+
+    def costs_nothing(self, number: int) -> bool:
+        """Tell whether the matches of a level are there for all pairs, used or beside others."""
+        has_all = not self.pairs_without_learned_matches()
+        return number == self.learned_level and has_all
+
+    def levels_worth_trying(self, *, may_cost: bool) -> list[int]:
+        """Return the usable levels that cost nothing, or may cost and were not in vain."""
+        found = list[int]()
+        for number in self.usable:
+            may_help = may_cost and not self.is_in_vain(number)
+            if may_help or self.costs_nothing(number):
+                found.append(number)
+        return found
 
     @property
     def first_model_s(self) -> float:
@@ -309,12 +340,16 @@ class Plan:
     left_s: float = 0.0  # of one core, at most
 
 
-def next_step(situation: Situation, effort: EffortName) -> Plan:
+def next_step(
+    situation: Situation, effort: EffortName, *, may_cost: bool = True
+) -> Plan:
     """Return what is matched again now; a step without pairs where nothing is likely to help.
 
     Args:
         situation: what is known of the set.
         effort: how long is tried.
+        may_cost: otherwise only matches that are there already may take the place of others,
+            unless the effort gives up nothing.
 
     Returns:
         The step, and at most how long it and those after it take, in seconds of one core.
@@ -329,7 +364,10 @@ def next_step(situation: Situation, effort: EffortName) -> Plan:
         if learned.pairs:
             return Plan(learned, max(0.0, left_s) + situation.first_model_s)
     hopeful = list[Step]()
-    for number in situation.usable:
+    numbers = situation.usable
+    if EFFORTS[effort].gives_up:
+        numbers = situation.levels_worth_trying(may_cost=may_cost)
+    for number in numbers:
         step = situation.best_step(number, left_s)
         if is_hopeful(step, situation):
             hopeful.append(step)

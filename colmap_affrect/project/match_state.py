@@ -35,16 +35,20 @@ class LearnedModels:
 
     of_set: str  # digest of the pairs, and of what is said by hand
     score: float  # 0 where there are none
-    is_sure: bool  # of all images
     score_without: float  # of the first models
+    is_of_most: bool = False  # most poses are expected to be right in one of them
     is_chosen: bool = False
 
     @property
     def is_enough(self) -> bool:
-        """Whether nothing is left to try with them, or nothing is there to go on from without."""
+        """Whether all else goes on from them, and nothing from the first models.
+
+        These are left where not one of their relative poses is expected to be right, or where one
+        model of learned matches has most poses right: any better one has some of these, too.
+        """
         is_better = self.score > self.score_without
         return is_better and (
-            self.is_sure or self.score_without < NOTHING_TO_GO_ON_FROM
+            self.is_of_most or self.score_without < NOTHING_TO_GO_ON_FROM
         )
 
 

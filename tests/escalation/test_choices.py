@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_affrect.escalation import alternatives, escalate
+from colmap_affrect.escalation import alternatives, escalate, map_and_rematch
 from colmap_affrect.escalation.alternatives import (
     SCORE,
     Choice,
     _choice_of_learned_matches,
     _set_of,
+    give_up_learned_models,
+    has_models_to_go_on_from,
     keep_best,
     map_learned_matches,
     needs_learned_models,
@@ -24,6 +26,7 @@ from colmap_affrect.escalation.alternatives import (
 )
 from colmap_affrect.escalation.escalate import Escalation, Trial
 from colmap_affrect.escalation.expected_gain import PairState
+from colmap_affrect.escalation.map_and_rematch import _try_learned_matches
 from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
 from colmap_affrect.project.match_store import Learned, PairMatches
 from colmap_affrect.project.sealed_json import write_sealed
@@ -67,7 +70,7 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
 ) -> None:
     context = context_in(tmp_path)
     of_set = _set_of(context)
-    learned = LearnedModels(of_set, score=3.0, is_sure=False, score_without=1.0)
+    learned = LearnedModels(of_set, score=3.0, score_without=1.0)
     context.matches.state = MatchState(listed="pairs", learned_models=learned)
     let_models_have(now, monkeypatch)
     assert needs_learned_models(context) == is_needed
@@ -76,10 +79,15 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
 
 
 @pytest.mark.parametrize(
-    ("sure", "is_sure"), [(["a", "b", "c"], True), (["a", "b"], False), ([], False)]
+    ("probabilities", "is_of_most"),
+    [([0.7], True), ([0.65], False), ([0.6, 0.6], False), ([], False)],
 )
-def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
-    sure: list[str], *, is_sure: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_one_model_of_learned_matches_has_most_poses_right_or_none_has(
+    probabilities: list[float],
+    *,
+    is_of_most: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     context = context_in(tmp_path)
     context.by_hand.left_out = ()
@@ -89,8 +97,11 @@ def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
         recorded.append(learned_models)
 
     context.matches.update_state = update_state
-    model = SimpleNamespace(sure=sure, probabilities=dict.fromkeys(NAMES, 0.9))
-    monkeypatch.setattr(alternatives, "read_summaries", lambda _: [model])
+    models = []
+    for probability in probabilities:
+        model = SimpleNamespace(probabilities=dict.fromkeys(NAMES, probability))
+        models.append(model)
+    monkeypatch.setattr(alternatives, "read_summaries", lambda _: models)
     monkeypatch.setattr(
         alternatives, "_choice_of_learned_matches", lambda _: Choice((), {})
     )
@@ -99,9 +110,26 @@ def test_models_of_learned_matches_are_sure_where_they_are_of_all_images(
     mapper: Any = None
     map_learned_matches(escalation, mapper)
     (found,) = recorded
-    assert found.is_sure == is_sure
-    assert found.score == pytest.approx(3 * 0.9 - 1.0)
+    assert found.is_of_most == is_of_most
+    expected = sum(3 * probability - 1.0 for probability in probabilities)
+    assert found.score == pytest.approx(expected)
     assert found.score_without == 1.2
+
+
+@pytest.mark.parametrize(
+    ("learned_models", "is_enough"),
+    [
+        (LearnedModels("set", 3.0, 2.0, is_of_most=True), True),
+        (LearnedModels("set", 2.0, 2.0, is_of_most=True), False),  # not better
+        (LearnedModels("set", 3.0, 2.0), False),  # others may be better than both
+        (LearnedModels("set", 3.0, 0.9), True),  # nothing else to go on from
+        (LearnedModels("set", 3.0, 1.0), False),
+    ],
+)
+def test_learned_models_with_most_poses_right_are_enough_where_they_are_better(
+    learned_models: LearnedModels, *, is_enough: bool
+) -> None:
+    assert learned_models.is_enough == is_enough
 
 
 def test_the_best_models_are_kept_with_their_matches(
@@ -289,6 +317,163 @@ def test_pairs_that_have_learned_matches_are_not_matched_again(
     monkeypatch.setattr(escalation, "write", lambda: None)
     assert escalation.match_learned() == 1
     assert matched == [([("b", "c")], 2)]
+
+
+@pytest.mark.parametrize(
+    ("worths", "is_in_vain"),
+    [
+        ({("a", "b"): 31, ("b", "c"): 41}, False),
+        ({("a", "b"): 31, ("b", "c"): 40}, True),  # better for half of them
+        ({("a", "b"): 31}, False),  # not yet known
+    ],
+)
+def test_learned_matches_tie_most_verified_pairs_better_or_are_expected_to_be_in_vain(
+    worths: dict[tuple[str, str], int],
+    *,
+    is_in_vain: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The pair of b and d is not verified, and that of a and c was rejected."""
+    num_inliers = {("a", "b"): 30, ("b", "c"): 40, ("b", "d"): 0}
+    pairs = (*num_inliers, ("a", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    escalation = escalation_of(context)
+    monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: num_inliers)
+    learned = {}
+    for pair, count in worths.items():
+        learned[pair] = Learned(matches_of(*pair, 2), (count, 0))
+    asked = list[Any]()
+    stores: Any = escalation.matches
+    stores.learned = lambda of_pairs: asked.append(of_pairs) or learned
+    assert escalation.ties_verified_pairs_no_better == is_in_vain
+    assert asked == [[("a", "b"), ("b", "c")]]
+
+
+def test_learned_matches_of_no_verified_pair_may_be_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path, learned_matching=Begun(2, (("a", "b"),)))
+    escalation = escalation_of(context)
+    monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: {("a", "b"): 0})
+    stores: Any = escalation.matches
+    stores.learned = lambda _: {}
+    assert not escalation.ties_verified_pairs_no_better
+
+
+@pytest.mark.parametrize(
+    ("has_models", "ties_no_better", "done"),
+    [
+        (True, True, ["verified", "given up"]),
+        (True, False, ["verified", "all", "mapped"]),
+        (False, True, ["all", "mapped"]),  # there is nothing to lose
+    ],
+)
+def test_learned_matches_that_tie_verified_pairs_no_better_are_given_up(
+    has_models: bool,
+    ties_no_better: bool,
+    done: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All other pairs were matched, and mapped, in vain before."""
+    found = list[str]()
+
+    def match_learned(*, only_verified: bool = False) -> int:
+        found.append("verified" if only_verified else "all")
+        return 2
+
+    escalation: Any = SimpleNamespace(
+        context=None,
+        plan_learned_matching=lambda: True,
+        match_learned=match_learned,
+        ties_verified_pairs_no_better=ties_no_better,
+        has_all_learned_matches=True,
+        add_to_report=lambda _, num_pairs: found.append(num_pairs),
+    )
+    patches = {
+        "needs_learned_models": lambda _: True,
+        "has_models_to_go_on_from": lambda _: has_models,
+        "give_up_learned_models": lambda _: found.append("given up"),
+        "map_learned_matches": lambda *_: found.append("mapped"),
+    }
+    for name, function in patches.items():
+        monkeypatch.setattr(map_and_rematch, name, function)
+    mapper: Any = None
+    _try_learned_matches(escalation, mapper)
+    num_pairs = 2 * len({"verified", "all"}.intersection(done))
+    assert found == [*done, num_pairs]
+
+
+def test_steps_cost_nothing_while_models_are_worse_than_the_best_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first steps made them worse; after those that follow the best ones come back."""
+    found = list[bool]()
+
+    def take_steps(_: Any, *, may_cost: bool) -> None:
+        found.append(may_cost)
+
+    inputs = iter(("first", "second", "second", "second", "second", "second"))
+    is_worse = iter((False, True, False))
+    escalation: Any = SimpleNamespace(
+        has_stepped=True, take_steps=take_steps, final_report=lambda: None
+    )
+    patches = {
+        "begin": lambda *_: escalation,
+        "adopt_chosen_models": lambda _: None,
+        "_map_first": lambda *_: [],
+        "_try_learned_matches": lambda *_: None,
+        "choose_learned": lambda *_, **__: False,
+        "has_become_worse": lambda _: next(is_worse),
+        "_map_on": lambda *_: [],
+        "restore_best": lambda _: len(found) == 2,
+        "remove_alternatives": lambda _: None,
+    }
+    for name, function in patches.items():
+        monkeypatch.setattr(map_and_rematch, name, function)
+    workspace = SimpleNamespace(model_inputs=lambda: next(inputs))
+    context: Any = SimpleNamespace(workspace=workspace)
+    recipe: Any = SimpleNamespace(escalate=None)
+    mapper: Any = None
+    map_and_rematch.map_and_rematch(context, mapper, recipe)
+    assert found == [True, False, True]
+
+
+def test_learned_models_that_were_given_up_are_needed_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = context_in(tmp_path)
+
+    def update_state(**changes: Any) -> None:
+        context.matches.state = MatchState(listed="pairs", **changes)
+
+    context.matches.update_state = update_state
+    let_models_have(1.5, monkeypatch)
+    assert needs_learned_models(context)
+    give_up_learned_models(context)
+    assert not needs_learned_models(context)
+    let_models_have(0.9, monkeypatch)
+    assert not has_models_to_go_on_from(context)
+
+
+def test_verified_pairs_may_be_matched_by_learned_matching_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = (("a", "b"), ("b", "c"))
+    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
+    context.deadline_s = float("inf")
+    escalation = escalation_of(context)
+    num_inliers = {("a", "b"): 0, ("b", "c"): 30}
+    monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: num_inliers)
+    stores: Any = escalation.matches
+    stores.learned_levels = lambda asked: dict.fromkeys(asked, -1)
+    matched = list[Any]()
+    monkeypatch.setattr(
+        escalation, "_match_with", lambda batch, *_: matched.extend(batch)
+    )
+    monkeypatch.setattr(escalation, "write", lambda: None)
+    assert escalation.match_learned(only_verified=True) == 1
+    assert matched == [("b", "c")]
 
 
 def test_pairs_that_were_rejected_since_are_not_matched_by_learned_matching(

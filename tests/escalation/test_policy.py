@@ -107,6 +107,43 @@ def test_strong_pairs_of_images_in_need_are_matched_by_networks_too(
     assert len(learned_step(replace(strong, states=states)).pairs) == 7
 
 
+def with_state(given: Situation, pair: Pair, state: PairState) -> Situation:
+    """Return a situation in which another state is known of a pair."""
+    return replace(given, states={**given.states, pair: state})
+
+
+def test_a_level_whose_matches_no_pair_uses_is_given_up_but_at_high_effort() -> None:
+    """It was tried for the most promising pairs; models with its matches were worse."""
+    tried = situation(usable=[1], tried={"ad": 0b11})
+    assert tried.is_in_vain(1)
+    assert not next_step(tried, "normal").step.pairs
+    assert next_step(tried, "high").step.pairs
+    used = with_state(tried, ("b", "d"), PairState(20, level=1, tried=0b11))
+    assert not used.is_in_vain(1)
+    assert next_step(used, "normal").step.pairs
+    assert not situation(usable=[1]).is_in_vain(1)  # it was not tried
+
+
+def test_no_level_is_given_up_while_nothing_is_registered_or_of_large_sets() -> None:
+    assert not situation(weights=NAMES, tried={"ad": 0b11}).is_in_vain(1)
+    many = [f"{number:02}" for number in range(policy.SMALL + 1)]
+    assert not situation(many, weights=many[:2], tried={"0002": 0b11}).is_in_vain(1)
+
+
+def test_models_that_have_become_worse_get_only_matches_that_are_there_already() -> (
+    None
+):
+    before = situation(usable=[1, LEARNED])
+    assert next_step(before, "normal").step.pairs
+    assert not next_step(before, "normal", may_cost=False).step.pairs
+    assert next_step(before, "high", may_cost=False).step.pairs
+    states = {}
+    for pair in before.states:
+        states[pair] = PairState(0, 3, learned_level=LEARNED)
+    there = replace(before, states=states)
+    assert next_step(there, "normal", may_cost=False).step.level == LEARNED
+
+
 def test_without_weights_other_levels_are_tried() -> None:
     assert learned_step(situation(usable=[1, 3])).pairs == ()
     assert next_step(situation(usable=[1, 3]), "normal").step.level in (1, 3)

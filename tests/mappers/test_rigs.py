@@ -11,7 +11,7 @@ import pytest
 from mapping_tasks import mapper_of, synthesize
 
 import colmap_affrect
-from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap import model_files, pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.model_files import all_see_long_tracks, num_long_tracks
@@ -136,6 +136,16 @@ def test_models_with_enough_long_tracks_are_told_from_others(tmp_path: Path) -> 
     assert all_see_long_tracks(model, images, least)
     assert not all_see_long_tracks(model, images, least + 1)
     assert all_see_long_tracks(model, [], least + 1)
+
+
+def test_points_are_not_gone_through_where_an_image_has_too_few(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = synthesize_rig(tmp_path / "database.db")
+    images = sorted(model.reg_image_ids())
+    most = max(model.images[image_id].num_points3D for image_id in images)
+    monkeypatch.setattr(model_files, "_long_tracks", None)
+    assert not all_see_long_tracks(model, images, most + 1)
 
 
 @pytest.mark.parametrize(("mapper", "most"), [("incremental", 1.6e5), ("sparse", 4e5)])

@@ -332,7 +332,7 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     matches.write([pair_matches(pair, [[0, 0]], 1) for pair in pairs])
     stationary = (((40, 30), ((1, 2), (3, 4))),)
     matches.update_state(stationary=stationary, effort="high", listed="digest")
-    learned_models = LearnedModels("digest", 2.5, is_sure=True, score_without=0.75)
+    learned_models = LearnedModels("digest", 2.5, 0.75, is_of_most=True)
     matches.update_state(
         step=Begun(1, pairs),
         has_stepped=True,
