@@ -70,7 +70,10 @@ def _num_supporting(points1: Array, points2: Array, maps: Array) -> Indices:
 
 
 def _distances(points: Array, rows: Indices) -> Array:
-    return np.asarray(np.linalg.norm(points[rows, None] - points, axis=2))
+    """Return the (R, M) distances of some of (M, 2) points from all, faster than ``norm`` does."""
+    horizontal = points[rows, None, 0] - points[:, 0]
+    vertical = points[rows, None, 1] - points[:, 1]
+    return np.asarray(np.sqrt(horizontal * horizontal + vertical * vertical))
 
 
 @dataclass(frozen=True)
