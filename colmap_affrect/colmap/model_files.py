@@ -23,11 +23,11 @@ from colmap_affrect import errors
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_writes import native_writes, why_not_written
 from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.project.record import file_sha256
 from colmap_affrect.project.regular_files import (
     open_regular,
     read_regular_text,
     require_regular,
-    sha256_of_regular,
 )
 
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
@@ -233,7 +233,7 @@ def file_digests(folder: Path) -> dict[str, str]:
     found = {}
     for name in RECORDS:
         with suppress(OSError):
-            found[name] = sha256_of_regular(folder / name)
+            found[name] = file_sha256(folder / name)
     return found
 
 

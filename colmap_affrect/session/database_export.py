@@ -101,38 +101,40 @@ def _write_keypoints(context: Context, names: Sequence[str]) -> None:
 
 def write_matches(
     context: Context,
-    database: pycolmap.Database,
     pairs: Sequence[Pair],
     *,
     replaces: bool = False,
 ) -> None:
     """Put the raw matches that the database lacks into it; it has images and keypoints.
 
+    One that lacks none is only read, so that what is known of its rows stays known.
+
     They are written in batches: a run that is killed loses one, and writes it when it is repeated.
 
     Args:
         context: of the workspace.
-        database: that of the workspace, open.
         pairs: of image names; those that are not stored are passed over.
         replaces: also put in those that are others there, whose two-view geometry goes.
     """
     listed = PairList.of(pairs)
-    ids = {image.name: image.image_id for image in database.read_all_images()}
+    ids = context.graph.ids
     known_ids = np.array([ids.get(name, 0) for name in listed.names], np.int64)
     ids_of_pairs = known_ids[listed.numbers]
     wanted = np.min(ids_of_pairs, axis=1, initial=1) > 0  # both images are there
     if not replaces:
-        wanted = colmap_database.lack_matches(database, ids_of_pairs)
+        with context.graph.open_to_read() as database:
+            wanted = colmap_database.lack_matches(database, ids_of_pairs)
     todo = listed.at(wanted)
     if not todo:
         return
     stored = context.matches.read(todo)
-    batch = list(islice(stored, PAIRS_PER_WRITE))
-    while batch:
-        with pycolmap.DatabaseTransaction(database):
-            for found in batch:
-                first, second = found.names
-                colmap_database.write_matches(
-                    database, ids[first], ids[second], found.indices
-                )
+    with context.graph.open_to_change(for_pairs=True) as database:
         batch = list(islice(stored, PAIRS_PER_WRITE))
+        while batch:
+            with pycolmap.DatabaseTransaction(database):
+                for found in batch:
+                    first, second = found.names
+                    colmap_database.write_matches(
+                        database, ids[first], ids[second], found.indices
+                    )
+            batch = list(islice(stored, PAIRS_PER_WRITE))

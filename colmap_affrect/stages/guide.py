@@ -9,7 +9,7 @@ matches stay as they are, as with COLMAP's own guided matching.
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from colmap_affrect.geometry.arrays import Array, Indices, Singles, rows_in
 from colmap_affrect.geometry.epipolar import PairModel
 from colmap_affrect.geometry.tilts import are_individual_shapes
 from colmap_affrect.matchers.guided import GuidedOptions, guided_matches
+from colmap_affrect.options import digest_of
 from colmap_affrect.pairs.lists import USUAL_IMAGES_IN_MEMORY, Pair, ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.feature_store import FeatureStore
@@ -55,16 +56,44 @@ def guide(context: Context, options: GuidedOptions | None = None) -> StageReport
     workspace.require("verify")
     options = options or context.guiding
     workspace.record_options("guide", options.to_mapping())
+    known = current(context)
+    todo = list[Pair]()
     guiding = Guiding(context, options)
-    todo, num_done = guiding.todo()
+    if not _is_finished(context, options, known):
+        todo = guiding.todo(known)
     with context.progress.stage("guide", len(todo), "pairs") as advance:
         guiding.guide(todo, advance)
+    digest = _digest(context, options, current(context) if todo else known)
+    workspace.record_input_digests(guided=digest)
     return StageReport(
         name="guide",
         wall_s=time.perf_counter() - start,
         num_done=len(todo),
-        num_kept=num_done,
+        num_kept=len(known),
     )
+
+
+def _is_finished(
+    context: Context, options: GuidedOptions, known: Sequence[GuidedPair]
+) -> bool:
+    """Tell whether all pairs were looked at when they were as they are now."""
+    finished = context.workspace.input_digest("guided")
+    return bool(finished) and finished == _digest(context, options, known)
+
+
+def _digest(
+    context: Context, options: GuidedOptions, known: Sequence[GuidedPair]
+) -> str:
+    """Return a digest of what decides which pairs are guided.
+
+    Args:
+        context: of the workspace.
+        options: of guided matching.
+        known: the guided pairs whose geometry is the one on record.
+    """
+    guided = [[*pair.names, pair.num_inliers, len(pair.exact)] for pair in known]
+    chosen = [options.to_mapping(), context.verification.to_mapping()]
+    return digest_of([context.graph.digest(), chosen, guided])
 
 
 def exact_inliers(
@@ -164,31 +193,33 @@ class Guiding:
         # Bands are as wide as features are exact: in pixels of the images as they were extracted.
         sizes = context.features.image_sizes().items()
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes}
-        self.verifier = PairVerifier(
-            ids=context.graph.ids,
-            cameras=context.graph.cameras,
-            options=context.verification,
-            extracted_px=extracted_px(context),
+
+    @cached_property
+    def verifier(self) -> PairVerifier:
+        """What verifies guided pairs, made when the first one is there."""
+        return PairVerifier(
+            ids=self.context.graph.ids,
+            cameras=self.context.graph.cameras,
+            options=self.context.verification,
+            extracted_px=extracted_px(self.context),
         )
 
-    def todo(self) -> tuple[list[Pair], int]:
-        """Return the pairs to guide, and how many are done."""
-        known = current(self.context)
+    def todo(self, known: Sequence[GuidedPair]) -> list[Pair]:
+        """Return the pairs to guide.
+
+        Args:
+            known: those that are guided already.
+        """
         exact = exact_inliers(self.context, known)
         images = self._images_to_guide(exact)
         pairs = [pair for pair in exact if not images.isdisjoint(pair)]
         escalated = self._escalated(pairs)
         done = {pair.names for pair in known}
         todo = list[Pair]()
-        num_done = 0
         for pair in pairs:
-            if frozenset(pair) in escalated:
-                continue
-            if pair in done:
-                num_done += 1
-            else:
+            if pair not in done and frozenset(pair) not in escalated:
                 todo.append(pair)
-        return todo, num_done
+        return todo
 
     def _escalated(self, pairs: Sequence[Pair]) -> set[frozenset[str]]:
         """Return those pairs, as sets, that were matched again: they need no guided matching."""

@@ -102,8 +102,7 @@ def match(
     _record_options(context, options, overwrite=overwrite)
     missing = _match_missing(context, pairs, options)
     write_images_and_keypoints(context)
-    with context.graph.open_to_change(for_pairs=True) as database:
-        write_matches(context, database, pairs)
+    write_matches(context, pairs)
     wall_s = time.perf_counter() - start
     num_before = len(pairs) - missing.num
     return StageReport("match", wall_s, missing.num, num_before, warned=missing.warned)

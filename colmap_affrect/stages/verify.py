@@ -1,11 +1,12 @@
 """Verify: two-view geometries of the matched pairs, into the database."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_verification import ExtractedPx, verify_pairs
 from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.stage_report import StageReport
@@ -62,25 +63,29 @@ def update_verified(
         The number of pairs that were verified.
     """
     write_images_and_keypoints(context)
+    write_matches(context, pairs, replaces=replaces)
+    with context.graph.open_to_read() as database:
+        todo = colmap_database.pairs_to_verify(database)
+    progress = context.progress if shows else SILENT
+    with progress.stage("verify", len(todo), "pairs") as advance:
+        if len(todo):
+            _verify(context, todo, advance)
+    return len(todo)
+
+
+def _verify(context: Context, todo: Indices, advance: Callable[[int], None]) -> None:
+    """Verify pairs, which are given by the ids of their images, in the database."""
+    colmap_database.require_database_space(context.workspace.database, len(todo))
     sizes_px = extracted_px(context)
     with context.graph.open_to_change(for_pairs=True) as database:
-        write_matches(context, database, pairs, replaces=replaces)
-        todo = colmap_database.pairs_to_verify(database)
-        if len(todo):
-            colmap_database.require_database_space(
-                context.workspace.database, len(todo)
-            )
-        progress = context.progress if shows else SILENT
-        with progress.stage("verify", len(todo), "pairs") as advance:
-            verify_pairs(
-                database,
-                todo,
-                context.verification,
-                sizes_px,
-                advance,
-                context.executor,
-            )
-    return len(todo)
+        verify_pairs(
+            database,
+            todo,
+            context.verification,
+            sizes_px,
+            advance,
+            context.executor,
+        )
 
 
 def extracted_px(context: Context) -> ExtractedPx:

@@ -18,6 +18,7 @@ from colmap_affrect.colmap.database import num_matched_pairs, open_database
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.project.match_store import MatchStore, PairMatches
 from colmap_affrect.session import database_export
+from colmap_affrect.session.view_graph import ViewGraph
 
 NAMES = [f"{index}.png" for index in range(6)]
 NUM_KEYPOINTS = 20
@@ -45,13 +46,12 @@ def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         indices = np.stack([rows, rows], axis=1)
         found.append(PairMatches(pair, indices, scores, NUM_KEYPOINTS))
     matches.write(found)
-    return SimpleNamespace(matches=matches, path=path)
+    return SimpleNamespace(matches=matches, path=path, graph=ViewGraph(path))
 
 
 def write(context: Any) -> None:
     """Bring the database up to what is stored."""
-    with open_database(context.path) as database:
-        database_export.write_matches(context, database, exhaustive_pairs(NAMES))
+    database_export.write_matches(context, exhaustive_pairs(NAMES))
 
 
 def write_until_killed(context: Any, num_pairs: int) -> None:

@@ -17,6 +17,7 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.errors import StoreError
 from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.session.context import Context
 from colmap_affrect.stages import guide as stage
@@ -112,8 +113,42 @@ def test_only_images_in_need(context: Context, monkeypatch: pytest.MonkeyPatch) 
         p for p in every if NAMES[1] in p
     }
     in_need.add(NAMES[0])
+    context.workspace.record_input_digests(guided="")  # nothing is known to be finished
     report = guide(context)
     assert (report.num_done, report.num_kept) == (2, 3)
+
+
+def test_what_was_looked_at_is_looked_at_again_only_where_it_has_changed(
+    guided: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = Mock(return_value=list[Pair]())
+    monkeypatch.setattr(stage.Guiding, "todo", looked)
+    assert guide(guided, ALWAYS).num_kept == 6
+    assert not looked.called
+    first = min(guided.verified_inliers())
+    ids = guided.graph.ids
+    with guided.graph.open_to_change(for_pairs=True) as database:
+        database.delete_two_view_geometry(ids[first[0]], ids[first[1]])
+    guide(guided, ALWAYS)
+    assert looked.call_count == 1
+    guide(guided, ALWAYS)
+    assert looked.call_count == 1
+    guided.workspace.guided.unlink()
+    guide(guided, ALWAYS)
+    assert looked.call_count == 2
+
+
+def test_a_run_that_is_killed_has_not_looked_at_all_pairs(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where an earlier one had, and others were verified since."""
+    guide(context, ALWAYS)
+    verify_matches(context, overwrite=True)
+    monkeypatch.setattr(stage.Guiding, "guide", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        guide(context, ALWAYS)
+    monkeypatch.undo()
+    assert guide(context, ALWAYS).num_done == 6
 
 
 def test_captions_are_not_found_again(

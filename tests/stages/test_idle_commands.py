@@ -17,6 +17,8 @@ from colmap_affrect.pipeline.single_stages import (
     match,
     verify,
 )
+from colmap_affrect.project import record
+from colmap_affrect.project.regular_files import sha256_of_regular
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import photographs as photographs_module
 from colmap_affrect.report.observations import ModelReader
@@ -61,6 +63,37 @@ def test_an_idle_command_reads_neither_models_nor_rows(
     after = json.loads(copy.report.read_text())
     assert after["photographs"] == before["photographs"]
     assert after["made_from"] == before["made_from"] != ""
+
+
+def test_an_idle_run_looks_at_no_pair_and_reads_a_model_once(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Levels of the recipe differ in the size of photographs, which pairs are verified by."""
+
+    def again() -> RunReport:
+        return run(
+            photos, tmp_path / "out", recipe="default", cameras=CAMERAS, page=False
+        )
+
+    before = again()
+    hashed = list[str]()
+
+    def sha256(path: Path) -> str:
+        hashed.append(path.name)
+        return sha256_of_regular(path)
+
+    record._sha256.cache_clear()
+    monkeypatch.setattr(record, "sha256_of_regular", sha256)
+    for name in (
+        "project.match_store.MatchStore.levels",
+        "session.view_graph.rows_digest",
+        "session.view_graph._read_inliers",
+        "stages.guide.weakly_connected_images",
+    ):
+        monkeypatch.setattr(f"colmap_affrect.{name}", None)
+    after = again()
+    assert hashed.count("points3D.bin") == len(after.models) == 1
+    assert after.guided == before.guided
 
 
 def edited(workspace: Workspace) -> None:
