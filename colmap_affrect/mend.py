@@ -2,7 +2,7 @@
 
 The stores, or the database that was copied, are what is true. Each command leaves a *seal*, the
 text file ``database.db.seal`` beside ``database.db``. It has a digest of the rows of the database,
-size and times of its file, and a digest of both lines: while these stay, the rows need not be read.
+a line of size and times of its file, and a digest of these two: while they fit, no row is read.
 A database whose rows have another digest was changed by another program. While a command works
 there is no seal, so that a killed one leaves none.
 """
@@ -130,7 +130,9 @@ def _seal(context: Context) -> None:
     if path.exists() and workspace.started_stages:
         # One that is not sealed is looked through next time.
         with suppress(AffrectError):
-            lines = [context.graph.digest(), _stamp(path)]
+            # The stamp first: what another program writes meanwhile is noticed next time.
+            stamp = _stamp(path)
+            lines = [context.graph.digest(), stamp]
             seal = "\n".join([*lines, _digest_of_seal(lines)])
             replace_text(workspace.seal, f"{seal}\n")
 

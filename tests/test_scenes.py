@@ -71,8 +71,10 @@ def test_facade_matches_follow_the_true_homography(view, low, high):
         first = facade_view(name, 1)
         second = facade_view(name, view)
         matches = MATCHER.match(first, second).indices
-        expected = project(homography, first.keypoints[matches[:, 0]])
-        errors = np.linalg.norm(expected - second.keypoints[matches[:, 1]], axis=1)
+        expected = project(homography, first.features.keypoints[matches[:, 0]])
+        errors = np.linalg.norm(
+            expected - second.features.keypoints[matches[:, 1]], axis=1
+        )
         correct[name] = int((errors < 3.0).sum())
     assert low < correct["rectified"] < high
     assert correct["rectified"] > 1.5 * correct["unrectified-rootsift"]

@@ -28,9 +28,11 @@ def run_cancellable(
     outcome: Future[Result] = Future()
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
     # the interpreter then ends under pycolmap's feet (bpo-45274).
+    begun = threading.Event()
     ended = threading.Event()
 
     def work() -> None:
+        begun.set()
         try:
             outcome.set_result(call(known))
         except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
@@ -45,7 +47,7 @@ def run_cancellable(
             pass
     except KeyboardInterrupt:
         known.cancel()
-        if not ended.wait(LEAVE_AFTER_S):
+        if begun.is_set() and not ended.wait(LEAVE_AFTER_S):
             _silence_until(ended)
         raise
     return outcome.result()
@@ -60,7 +62,8 @@ def _silence_until(ended: threading.Event) -> None:
 
     def restore() -> None:
         ended.wait()
-        pycolmap.logging.minloglevel = level
+        if pycolmap.logging.minloglevel == pycolmap.logging.FATAL.value:
+            pycolmap.logging.minloglevel = level
 
     threading.Thread(target=restore, daemon=True).start()
 

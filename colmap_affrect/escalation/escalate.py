@@ -384,11 +384,17 @@ class Escalation:
     def ties_verified_pairs_no_better(self) -> bool:
         """Whether learned matches have more inliers for no more than half of the verified pairs.
 
-        Of those that :meth:`plan_learned_matching` has. It is not known before all of these have
-        learned matches.
+        Of those that :meth:`plan_learned_matching` has, unless they use learned matches already. It
+        is not known before all of these have learned matches.
         """
         planned = self.matches.state.learned_matching or Begun(0, ())
         verified = self._verified_of(self._allowed(planned.pairs))
+        levels = self.matches.levels([*verified])
+        verified = {
+            pair: num_inliers
+            for pair, num_inliers in verified.items()
+            if levels[pair] != planned.level
+        }
         learned = self.matches.learned([*verified])
         if not verified or len(learned) < len(verified):
             return False

@@ -22,6 +22,7 @@ from colmap_affrect.escalation.alternatives import (
     update_keypoints_of_models,
 )
 from colmap_affrect.escalation.escalate import Escalation, begin
+from colmap_affrect.escalation.policy import EFFORTS
 from colmap_affrect.mappers.base import Mapper
 from colmap_affrect.mappers.mapping import model_folders
 from colmap_affrect.project.stage_report import StageReport
@@ -78,14 +79,15 @@ def _try_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
 
     The pairs that measured frames verify come first where there is something to go on from: models
     of learned matches are not likely to be better unless these tie most of them better. If not,
-    learned matching is a level as any other.
+    learned matching is a level as any other, where the effort has time for such.
     """
     context = escalation.context
     if not needs_learned_models(context) or not escalation.plan_learned_matching():
         return
     start = time.perf_counter()
     num_matched = 0
-    may_be_in_vain = has_models_to_go_on_from(context)
+    has_time_for_levels = not EFFORTS[context.effort].ends_after_learned_matching
+    may_be_in_vain = has_time_for_levels and has_models_to_go_on_from(context)
     if may_be_in_vain:
         num_matched += escalation.match_learned(only_verified=True)
     if may_be_in_vain and escalation.ties_verified_pairs_no_better:

@@ -1,12 +1,13 @@
 """What is matched again next, and when to stop: the policy of escalation, without its execution.
 
 1. Learned matching of whole photographs comes first, where its weights are there: it costs little
-   and helps where light, age or season differ. On small sets all pairs of images to match again are
-   matched by it, beside what is there (:mod:`colmap_affrect.escalation.alternatives`); on others as
-   many as take what the first model took.
+   and helps where light, age or season differ. On small sets the verified
+   pairs of images to match again are matched by it, beside what is there
+   (:mod:`colmap_affrect.escalation.alternatives`), then all others, unless it ties these no better;
+   on other sets as many as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
-   nothing is likely to help. Levels that were in vain are given up, but with high effort.
+   nothing is likely to help. Levels that were in vain are given up, except with high effort.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
 as any other.
@@ -32,8 +33,8 @@ from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.recipes import Level
 
-# Images up to which learned matching takes all pairs of images to match again; resource: these are
-# 435 pairs, some minutes of two cores
+# Images up to which learned matching may take all pairs of images to match again; resource: these
+# are 435 pairs, some minutes of two cores
 SMALL = 30
 # Photographs expected of all that the budget allows, below which nothing is tried; judged on the
 # same sets, by where photographs right against seconds are flat
@@ -55,6 +56,11 @@ class Effort:
     times_first_model: float
     without_model_s: float
     gives_up: bool = True
+
+    @property
+    def ends_after_learned_matching(self) -> bool:
+        """Whether no level may take any time after learned matching."""
+        return not (self.least_s or self.times_first_model or self.without_model_s)
 
     def budget_s(self, first_model_s: float, *, has_model: bool) -> float:
         """Return what levels after learned matching may take.
@@ -110,7 +116,7 @@ class Situation:
 
     @property
     def is_small(self) -> bool:
-        """Whether learned matching takes all pairs of images to match again."""
+        """Whether learned matching may take all pairs of images to match again."""
         return len(self.megapixels[0]) <= SMALL
 
     @property
@@ -165,7 +171,7 @@ class Situation:
         return has_been_tried and self.is_small and bool(self.registered)
 
     def costs_nothing(self, number: int) -> bool:
-        """Tell whether the matches of a level are there for all pairs, used or beside others."""
+        """Tell whether the matches of a level are there for all pairs of the set, used or not."""
         has_all = not self.pairs_without_learned_matches()
         return number == self.learned_level and has_all
 
@@ -393,8 +399,8 @@ def untried_by_level(situation: Situation) -> list[MatchedAgain]:
     """Return what a greater effort would try for images to match again, by level."""
     found = list[MatchedAgain]()
     for number in situation.usable:
-        if situation.is_small and number == situation.learned_level:
-            continue  # it was tried beside the others
+        if situation.is_small and situation.costs_nothing(number):
+            continue  # it was tried for all pairs, beside the others
         step = situation.best_step(number, math.inf)
         if is_hopeful(step, situation):
             kind = kind_of(situation.levels[number])

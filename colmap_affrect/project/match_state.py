@@ -43,8 +43,9 @@ class LearnedModels:
     def is_enough(self) -> bool:
         """Whether all else goes on from them, and nothing from the first models.
 
-        These are left where not one of their relative poses is expected to be right, or where one
-        model of learned matches has most poses right: any better one has some of these, too.
+        The first models are left where not one of their relative poses is expected to be right, or
+        where one model of learned matches has most poses right, so that no better model is without
+        some of these poses.
         """
         is_better = self.score > self.score_without
         return is_better and (

@@ -83,7 +83,7 @@ STAGES: tuple[str, ...] = get_args(Stage)
 # Characters of a value that is told; levels of recipes have thousands; display
 MAX_VALUE = 160
 FORMAT_VERSION = 13  # counts up when a stage records other options than before; format
-MADE_FROM = "made_from"  # digests of given files
+MADE_FROM = "made_from"  # digests of given files, and of what was looked at
 # What the models that are there were made from, and how many they are
 MAPPED = "mapped"
 PLANNED = "planned"  # options of stages that have not begun

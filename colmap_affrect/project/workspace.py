@@ -306,7 +306,7 @@ class Workspace:
         return None
 
     def input_digest(self, what: str) -> str:
-        """Return the digest of the files that something was made from, empty if not known."""
+        """Return the digest of what something was made from, empty if not known."""
         return str(self.record().get(MADE_FROM, {}).get(what, ""))
 
     def record_input_digests(self, **digests: str) -> None:

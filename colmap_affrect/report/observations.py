@@ -87,6 +87,7 @@ class ModelReader:
     def __init__(self, sparse_path: Path) -> None:
         """Take the folder of all models; they are read when they are asked for."""
         self.sparse_path = sparse_path
+        self.unreadable = set[int]()  # models whose figures could not be counted
         self._models = dict[int, pycolmap.Reconstruction]()
         self._observations = dict[int, Observations]()
 

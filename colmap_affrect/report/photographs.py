@@ -130,6 +130,7 @@ def _of_model(reader: ModelReader, number: int) -> dict[str, dict[str, Any]]:
         model = reader.model(number)
         seen = reader.observations(number)
     except AffrectError:
+        reader.unreadable.add(number)
         return {}
     counts = np.bincount(seen.rows, minlength=len(seen.names))
     errors_px = seen.mean_errors_px()

@@ -128,7 +128,8 @@ def _report(
         cameras=cameras,
         lines=lines,
         photographs=photographs,
-        made_from=figures_digest(key, photographs),
+        # Figures that lack a model are counted again by the next command.
+        made_from=figures_digest("" if models.unreadable else key, photographs),
         focal_contradictions=focal_contradictions,
         extended=tuple(result.extended),
         advice=advice(

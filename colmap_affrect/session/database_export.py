@@ -107,7 +107,8 @@ def write_matches(
 ) -> None:
     """Put the raw matches that the database lacks into it; it has images and keypoints.
 
-    One that lacks none is only read, so that what is known of its rows stays known.
+    One that lacks none is only read, so that what is known of its rows stays known, unless others
+    are to be replaced.
 
     They are written in batches: a run that is killed loses one, and writes it when it is repeated.
 

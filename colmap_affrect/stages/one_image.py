@@ -89,15 +89,14 @@ class ImageExtractor:
     """
 
     options: ExtractionOptions  # of the recipe
-    # By level, but those that wait for weights
+    # By level that was asked for, but those that wait for weights
     extractors: Mapping[int, FeatureExtractor]
     rectifiers: Mapping[int, Rectifier]  # of the same levels
     # Files of the networks by key
     weights: Mapping[str, Path] = field(default_factory=dict)
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
-    only_first: bool = (
-        False  # it has no other level, but for weights that are not published
-    )
+    # It lacks the levels of escalation whose weights are the published ones
+    only_first: bool = False
     # Held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(default_factory=Lock)
 
@@ -337,8 +336,8 @@ def prepare(
         image_names: of the images to come, to see whether there are depth maps for them; None: do
             not look.
         progress: where to show downloads.
-        only_first: build no parts of levels of escalation, so that torch is not loaded for them;
-            files that are not the published ones are tried nevertheless.
+        only_first: build no parts of levels of escalation whose weights are the published ones, so
+            that torch is not loaded for them; all others are tried nevertheless.
 
     Returns:
         What is called for every photograph.
@@ -377,11 +376,12 @@ def prepare(
 def _first_and_unpublished(
     levels: Mapping[int, Level], weights: Mapping[str, Path]
 ) -> dict[int, Level]:
-    """Return the first level, and those with files of weights that are not the published ones."""
+    """Return the first level, and those that do not work with published weights alone."""
     published = {key for key, path in weights.items() if is_published(key, path)}
     found = {}
     for number, level in levels.items():
-        if number == 0 or not published.issuperset(_weights_of(level)):
+        needed = _weights_of(level)
+        if number == 0 or not needed or not published.issuperset(needed):
             found[number] = level
     return found
 

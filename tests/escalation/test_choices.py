@@ -320,15 +320,18 @@ def test_pairs_that_have_learned_matches_are_not_matched_again(
 
 
 @pytest.mark.parametrize(
-    ("worths", "is_in_vain"),
+    ("worths", "used_levels", "is_in_vain"),
     [
-        ({("a", "b"): 31, ("b", "c"): 41}, False),
-        ({("a", "b"): 31, ("b", "c"): 40}, True),  # better for half of them
-        ({("a", "b"): 31}, False),  # not yet known
+        ({("a", "b"): 31, ("b", "c"): 41}, [0, 0], False),
+        ({("a", "b"): 31, ("b", "c"): 40}, [0, 1], True),  # better for half of them
+        ({("a", "b"): 31}, [0, 0], False),  # not yet known
+        ({("a", "b"): 31}, [0, 2], False),  # better for the one that does not use them
+        ({("a", "b"): 30}, [0, 2], True),
     ],
 )
 def test_learned_matches_tie_most_verified_pairs_better_or_are_expected_to_be_in_vain(
     worths: dict[tuple[str, str], int],
+    used_levels: list[int],
     *,
     is_in_vain: bool,
     tmp_path: Path,
@@ -346,8 +349,11 @@ def test_learned_matches_tie_most_verified_pairs_better_or_are_expected_to_be_in
     asked = list[Any]()
     stores: Any = escalation.matches
     stores.learned = lambda of_pairs: asked.append(of_pairs) or learned
+    stores.levels = lambda of_pairs: dict(zip(of_pairs, used_levels, strict=True))
     assert escalation.ties_verified_pairs_no_better == is_in_vain
-    assert asked == [[("a", "b"), ("b", "c")]]
+    assert asked == [
+        [("a", "b"), ("b", "c")][: used_levels.count(0) + used_levels.count(1)]
+    ]
 
 
 def test_learned_matches_of_no_verified_pair_may_be_better(
@@ -358,18 +364,21 @@ def test_learned_matches_of_no_verified_pair_may_be_better(
     monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: {("a", "b"): 0})
     stores: Any = escalation.matches
     stores.learned = lambda _: {}
+    stores.levels = lambda _: {}
     assert not escalation.ties_verified_pairs_no_better
 
 
 @pytest.mark.parametrize(
-    ("has_models", "ties_no_better", "done"),
+    ("effort", "has_models", "ties_no_better", "done"),
     [
-        (True, True, ["verified", "given up"]),
-        (True, False, ["verified", "all", "mapped"]),
-        (False, True, ["all", "mapped"]),  # there is nothing to lose
+        ("normal", True, True, ["verified", "given up"]),
+        ("normal", True, False, ["verified", "all", "mapped"]),
+        ("normal", False, True, ["all", "mapped"]),  # there is nothing to lose
+        ("low", True, True, ["all", "mapped"]),  # no later step would match the others
     ],
 )
 def test_learned_matches_that_tie_verified_pairs_no_better_are_given_up(
+    effort: str,
     has_models: bool,
     ties_no_better: bool,
     done: list[str],
@@ -383,7 +392,7 @@ def test_learned_matches_that_tie_verified_pairs_no_better_are_given_up(
         return 2
 
     escalation: Any = SimpleNamespace(
-        context=None,
+        context=SimpleNamespace(effort=effort),
         plan_learned_matching=lambda: True,
         match_learned=match_learned,
         ties_verified_pairs_no_better=ties_no_better,

@@ -294,6 +294,16 @@ def test_what_was_tried_and_what_was_not_is_told_by_kind() -> None:
     assert kinds["measured, all tilts"].core_s > 0.0
 
 
+def test_learned_matching_is_untried_where_some_pairs_lack_it() -> None:
+    after = done_with_learned()
+    states = dict(after.states)
+    for pair, state in states.items():
+        if "d" in pair:
+            states[pair] = replace(state, learned_level=-1)
+    kinds = {one.kind for one in untried_by_level(replace(after, states=states))}
+    assert "learned" in kinds
+
+
 @pytest.mark.parametrize(
     ("number", "needless_after"), [(1, [1, 3]), (2, [2, 4]), (3, [3]), (4, [4])]
 )

@@ -290,10 +290,6 @@ def test_pair_is_looked_at_by_half_of_its_features_at_most() -> None:
     assert 40 < len(some) == len(of_half) <= NUM_SHAPED // 2
 
 
-def test_pairs_are_looked_at_by_two_thousand_features() -> None:
-    assert 1000 < nearest.NUM_LOOKED_AT < 4000
-
-
 @pytest.mark.usefixtures("few_looked_at")
 def test_pair_whose_frames_tell_nothing_is_matched_as_a_whole() -> None:
     images = []

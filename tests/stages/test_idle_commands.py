@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from verified import CAMERAS, copy_of
@@ -20,7 +23,9 @@ from colmap_affrect.pipeline.single_stages import (
 from colmap_affrect.project import record
 from colmap_affrect.project.regular_files import sha256_of_regular
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import kept_figures
 from colmap_affrect.report import photographs as photographs_module
+from colmap_affrect.report.kept_figures import figures_digest
 from colmap_affrect.report.observations import ModelReader
 from colmap_affrect.report.run_report import RunReport
 
@@ -140,14 +145,35 @@ def test_figures_of_a_report_that_is_not_of_these_models_are_counted_again(
     assert counted == [0]
 
 
-def test_figures_are_those_of_the_models_of_another_seed(copy: Workspace) -> None:
-    before = json.loads(copy.report.read_text())
-    report = map_images(
-        copy.path, mapping={"random_seed": 5}, overwrite=True, page=False
-    )
-    after = json.loads(copy.report.read_text())
-    assert after["made_from"] != before["made_from"]
-    assert report.photographs["a.png"].num_points > 30
+def test_figures_of_other_models_are_counted_again(copy: Workspace) -> None:
+    content = json.loads(copy.report.read_text())
+    expected = deepcopy(content["photographs"])
+    photographs = kept_figures._PHOTOGRAPHS.validate_python(content["photographs"])
+    for name, photograph in photographs.items():
+        photographs[name] = replace(photograph, num_points=7)
+        content["photographs"][name]["num_points"] = 7
+    content["made_from"] = figures_digest("other models", photographs)
+    copy.report.write_text(json.dumps(content))
+    assert kept_figures.kept_figures(copy.report, "other models")
+    map_again(copy)
+    assert json.loads(copy.report.read_text())["photographs"] == expected
+
+
+def test_figures_that_lack_a_model_are_counted_again(
+    copy: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = json.loads(copy.report.read_text())["photographs"]
+
+    def unreadable(*_: object) -> NoReturn:
+        raise AffrectError("too many files are open")
+
+    copy.report.unlink()
+    with monkeypatch.context() as patched:
+        patched.setattr(ModelReader, "observations", unreadable)
+        map_again(copy)
+    assert json.loads(copy.report.read_text())["photographs"] != expected
+    map_again(copy)
+    assert json.loads(copy.report.read_text())["photographs"] == expected
 
 
 def test_each_command_leaves_the_digest_of_the_rows_that_there_are(

@@ -227,7 +227,10 @@ def test_work_in_another_process_refuses_other_weights(
 def test_extraction_builds_no_networks_that_only_escalation_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here and in another process; files that are not the published ones are tried at once."""
+    """Here and in another process; files that are not the published ones are tried at once.
+
+    So is level 1, which takes no files.
+    """
     keys = ("affnet", "aliked-n16")
     files = {key: tmp_path / key for key in keys}
     for path in files.values():
@@ -240,7 +243,7 @@ def test_extraction_builds_no_networks_that_only_escalation_needs(
     prepared = prepare(extraction, only_first=True)
     elsewhere = pickle.loads(pickle.dumps(prepared))
     for extractor in (prepared, elsewhere):
-        assert [*extractor.extractors] == [*extractor.rectifiers] == [0]
+        assert [*extractor.extractors] == [*extractor.rectifiers] == [0, 1]
         assert extractor.weights == files
     with pytest.raises(ImportError):
         prepare(extraction)

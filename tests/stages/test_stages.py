@@ -237,7 +237,12 @@ def test_stage_commands_do_what_run_does_for_its_first_model_and_it_goes_on_from
     assert made.pairs.read_bytes() == expected.pairs.read_bytes()
     record = dict(made.record())
     planned = record.pop("planned")
-    assert record | planned == expected.record()
+    done = dict(expected.record())
+    done["made_from"] = dict(done["made_from"])
+    assert done["made_from"].pop(
+        "guided"
+    )  # what guided matching has seen; run alone has it
+    assert record | planned == done
     assert image_ids(made.database) == image_ids(expected.database)
     assert database_content(made.database) == database_content(expected.database)
     reports = [
