@@ -239,6 +239,23 @@ def num_matched_pairs(path: Path) -> int:
     return len(matched)
 
 
+def num_inliers_of_pairs(
+    database: pycolmap.Database, min_num_inliers: int = 1
+) -> dict[tuple[int, int], int]:
+    """Return the number of inliers of verified pairs of image ids, without reading these.
+
+    Args:
+        database: to read.
+        min_num_inliers: of a pair; others are left out.
+    """
+    pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    found = {}
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        if count >= min_num_inliers:
+            found[pycolmap.pair_id_to_image_pair(pair_id)] = int(count)
+    return found
+
+
 def unverified_pairs(path: Path) -> Indices:
     """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:

@@ -249,9 +249,4 @@ class PairVerifier:
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:
     """Return the number of inliers of each verified pair of image ids."""
     with colmap_database.open_database(path) as database:
-        pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    return {
-        pycolmap.pair_id_to_image_pair(pair_id): int(count)
-        for pair_id, count in zip(pair_ids, counts, strict=True)
-        if count >= min_num_inliers
-    }
+        return colmap_database.num_inliers_of_pairs(database, min_num_inliers)

@@ -14,7 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import cameras_of_images, open_database
+from colmap_affrect.colmap.database import (
+    cameras_of_images,
+    num_inliers_of_pairs,
+    open_database,
+)
 from colmap_affrect.colmap.tables import rows_digest
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.lists import Pair
@@ -206,9 +210,6 @@ def _read_num_inliers(
     """Return the number of inliers of each verified pair, without reading them."""
     names = {image_id: name for name, image_id in images.ids.items()}
     found = dict[Pair, int]()
-    pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    for pair_id, count in zip(pair_ids, counts, strict=True):
-        if count:
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            found[names[first], names[second]] = int(count)
+    for (first, second), count in num_inliers_of_pairs(database).items():
+        found[names[first], names[second]] = count
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +28,7 @@ from colmap_affrect.escalation.alternatives import (
 from colmap_affrect.escalation.escalate import Escalation, Trial
 from colmap_affrect.escalation.expected_gain import PairState
 from colmap_affrect.escalation.map_and_rematch import _try_learned_matches
+from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.project.match_state import Begun, LearnedModels, MatchState
 from colmap_affrect.project.match_store import Learned, PairMatches
 from colmap_affrect.project.sealed_json import write_sealed
@@ -299,24 +301,43 @@ def test_learned_matches_are_used_of_the_level_that_is_asked_for(
     assert escalation._use_learned_matches([*learned], 3) == set()
 
 
+def matched_by_learned_matching(
+    context: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    learned_levels: Mapping[Pair, int],
+    num_inliers: Mapping[Pair, int],
+    only_verified: bool = False,
+) -> list[tuple[Pair, int]]:
+    """Return the pairs that are matched, with the level."""
+    context.deadline_s = float("inf")
+    escalation = escalation_of(context)
+    monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: num_inliers)
+    stores: Any = escalation.matches
+    stores.learned_levels = lambda pairs: {pair: learned_levels[pair] for pair in pairs}
+    matched = list[tuple[Pair, int]]()
+
+    def match_with(batch: Sequence[Pair], level: int, _: object) -> None:
+        matched.extend((pair, level) for pair in batch)
+
+    monkeypatch.setattr(escalation, "_match_with", match_with)
+    monkeypatch.setattr(escalation, "write", lambda: None)
+    num_matched = escalation.match_learned(only_verified=only_verified)
+    assert num_matched == len(matched)
+    return matched
+
+
 def test_pairs_that_have_learned_matches_are_not_matched_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pairs = (("a", "b"), ("b", "c"))
-    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
-    context.deadline_s = float("inf")
-    escalation = escalation_of(context)
-    stores: Any = escalation.matches
-    stores.learned_levels = lambda _: {("a", "b"): 2, ("b", "c"): -1}
-    matched = list[tuple[Any, int]]()
-    monkeypatch.setattr(
-        escalation,
-        "_match_with",
-        lambda batch, level, _: matched.append((batch, level)),
+    matched = matched_by_learned_matching(
+        context_in(tmp_path, learned_matching=Begun(2, pairs)),
+        monkeypatch,
+        learned_levels={("a", "b"): 2, ("b", "c"): -1},
+        num_inliers={},
     )
-    monkeypatch.setattr(escalation, "write", lambda: None)
-    assert escalation.match_learned() == 1
-    assert matched == [([("b", "c")], 2)]
+    assert matched == [(("b", "c"), 2)]
 
 
 @pytest.mark.parametrize(
@@ -469,20 +490,14 @@ def test_verified_pairs_may_be_matched_by_learned_matching_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pairs = (("a", "b"), ("b", "c"))
-    context = context_in(tmp_path, learned_matching=Begun(2, pairs))
-    context.deadline_s = float("inf")
-    escalation = escalation_of(context)
-    num_inliers = {("a", "b"): 0, ("b", "c"): 30}
-    monkeypatch.setattr(escalation.image_set, "num_inliers", lambda: num_inliers)
-    stores: Any = escalation.matches
-    stores.learned_levels = lambda asked: dict.fromkeys(asked, -1)
-    matched = list[Any]()
-    monkeypatch.setattr(
-        escalation, "_match_with", lambda batch, *_: matched.extend(batch)
+    matched = matched_by_learned_matching(
+        context_in(tmp_path, learned_matching=Begun(2, pairs)),
+        monkeypatch,
+        learned_levels=dict.fromkeys(pairs, -1),
+        num_inliers={("a", "b"): 0, ("b", "c"): 30},
+        only_verified=True,
     )
-    monkeypatch.setattr(escalation, "write", lambda: None)
-    assert escalation.match_learned(only_verified=True) == 1
-    assert matched == [("b", "c")]
+    assert matched == [(("b", "c"), 2)]
 
 
 def test_pairs_that_were_rejected_since_are_not_matched_by_learned_matching(
