@@ -40,6 +40,9 @@ TRIALS_PER_NEEDED_TRIAL = 1.0
 # with more 0.03 per cent; measured
 TRIALS_OF_FEW_INLIERS = 3.0
 MAX_FEW_INLIERS = 60  # measured
+# Raw matches of which fewer than half would be many inliers: as many samples at once are cheaper
+# then than few, and all of them once more; theory
+MAX_FEW_MATCHES = 2 * MAX_FEW_INLIERS
 # Largest of the shares of inliers that samples must suffice for: by it a hundred homographies
 # are drawn, the fewest that COLMAP draws for any pair; theory
 MAX_LEAST_SHARE = 0.5
@@ -150,9 +153,14 @@ def _significant_geometry(
 ) -> pycolmap.TwoViewGeometry | None:
     """Return the two-view geometry of keypoints, of which those of a row match.
 
-    Its inliers are rows, twice. None where there are too few of them, or chance made them.
+    Few inliers are searched by more samples. They are rows, twice. None where there are too few of
+    them, or chance made them.
     """
     search = _search_options(keypoints, options)
+    has_few_matches = len(keypoints[0]) < MAX_FEW_MATCHES
+    if has_few_matches and options.min_significance:
+        search.ransac.dyn_num_trials_multiplier = TRIALS_OF_FEW_INLIERS
+        return _searched_geometry(cameras, keypoints, options, search)
     geometry = _searched_geometry(cameras, keypoints, options, search)
     if geometry is None or not options.min_significance:
         return geometry

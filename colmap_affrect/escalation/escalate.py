@@ -25,6 +25,7 @@ from colmap_affrect.errors import Logged, such_as
 from colmap_affrect.escalation.expected_gain import PairState, Step
 from colmap_affrect.escalation.image_set import ImageSet
 from colmap_affrect.escalation.policy import (
+    EFFORTS,
     Plan,
     learned_step,
     matched_by_level,
@@ -294,12 +295,13 @@ class Escalation:
             level: number of the level in the recipe.
         """
         if pairs:
-            self.matches.update_state(step=Begun(level, tuple(pairs)), has_stepped=True)
+            self.matches.update_state(step=Begun(level, tuple(pairs)))
         known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        self.matches.update_state(step=None, has_stepped=True)
+        num_steps = self.matches.state.num_steps + 1
+        self.matches.update_state(step=None, num_steps=num_steps)
 
     def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
         """Use the learned matches of a level that are there already, where they are better.
@@ -334,11 +336,14 @@ class Escalation:
         An interrupted run resumes with these: images that get features change the database.
 
         Returns:
-            Whether there are any; none of sets that are large or need nothing, nor where no learned
-            level can be used.
+            Whether there are any; none of sets that are large or need nothing, where no learned
+            level can be used, and where it was not likely to help before the first step.
         """
         if self.matches.state.learned_matching:
             return True
+        effort = self.context.effort
+        if self.has_stepped and EFFORTS[effort].gives_up:
+            return False
         models = self.image_set.models()
         weights = self.image_set.weights(models)
         if not weights:
@@ -346,9 +351,9 @@ class Escalation:
         situation = self.image_set.situation(weights, models)
         if not situation.is_small:
             return False
-        step = learned_step(situation)
+        step = learned_step(situation, effort)
         if step.pairs:
-            after = next_step(situation, self.context.effort)
+            after = next_step(situation, effort)
             self.context.progress.expect(after.left_s / available_cores())
             self.matches.update_state(
                 learned_matching=Begun(step.level, tuple(step.pairs))

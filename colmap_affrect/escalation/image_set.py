@@ -191,6 +191,7 @@ class ImageSet:
             lacking=self._lacking_by_level(sizes),
             registered=models[0].registered_names,
             strong_num_inliers=self.options.strong_num_inliers,
+            num_steps=self.context.matches.state.num_steps,
         )
 
     def _megapixels_by_level(self, sizes: Mapping[str, Size]) -> list[dict[str, float]]:

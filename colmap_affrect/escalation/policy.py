@@ -101,6 +101,7 @@ class Situation:
         lacking: images without features of a level, by level.
         registered: images of the largest model.
         strong_num_inliers: pairs with as many inliers need nothing more.
+        num_steps: that were taken, each followed by mapping.
     """
 
     levels: Sequence[Level]
@@ -113,6 +114,7 @@ class Situation:
     lacking: Sequence[Collection[str]]
     registered: Collection[str] = ()
     strong_num_inliers: int = 100
+    num_steps: int = 0
 
     @property
     def is_small(self) -> bool:
@@ -188,7 +190,12 @@ class Situation:
     def first_model_s(self) -> float:
         """Nominal seconds of all that comes before escalation."""
         names = self.megapixels[0].keys()
-        return self.seconds(0, names, self.states.keys()) + MAPPING_S * len(names)
+        return self.seconds(0, names, self.states.keys()) + self.mapping_s
+
+    @property
+    def mapping_s(self) -> float:
+        """Nominal seconds of mapping once."""
+        return MAPPING_S * len(self.megapixels[0])
 
     def pairs_tried(self, number: int) -> list[Pair]:
         """Return the pairs that were matched at a level, also if the matches are not used."""
@@ -206,18 +213,26 @@ class Situation:
             names.update(pair)
         return self.seconds(number, names, pairs)
 
+    @property
+    def mapped_again_s(self) -> float:
+        """Nominal seconds of mapping after the steps so far."""
+        return self.num_steps * self.mapping_s
+
     def seconds_spent(self) -> float:
-        """Return the nominal seconds spent after learned matching, of which some is free."""
-        spent = list[float]()
-        learned = list[float]()
+        """Return the nominal seconds spent after learned matching, of which some is free.
+
+        With mapping after each step: on sets of some size it takes as long as the step itself.
+        """
+        spent_s = self.mapped_again_s
+        learned_s = 0.0
         for number in range(1, len(self.levels)):
             seconds = self.seconds_spent_at(number)
-            spent.append(seconds)
+            spent_s += seconds
             if kind_of(self.levels[number]) == LEARNED:
-                learned.append(seconds)
-        learned_s = sum(learned)
-        free_s = learned_s if self.is_small else min(learned_s, self.first_model_s)
-        return sum(spent) - free_s
+                learned_s += seconds
+        if self.is_small:
+            return spent_s - learned_s
+        return spent_s - min(learned_s + self.mapped_again_s, self.first_model_s)
 
     def planner(self, number: int, weights: Mapping[str, float]) -> StepPlanner:
         """Return what chooses the pairs of a level.
@@ -249,11 +264,20 @@ class Situation:
                 bits |= 1 << later
         return bits
 
-    def best_step(self, number: int, budget_s: float) -> Step:
-        """Return the best step of a level.
+    def weights_at(self, number: int) -> dict[str, float]:
+        """Return the images that a level may help, and how much, in photographs.
 
         Features without shapes mistake similar things for the same: images that others anchor do
         not need them.
+        """
+        weights = dict(self.weights)
+        if not self.is_measured(number):
+            for name in self.anchored:
+                weights.pop(name, None)
+        return weights
+
+    def best_step(self, number: int, budget_s: float) -> Step:
+        """Return the best step of a level.
 
         Args:
             number: of the level in the recipe.
@@ -262,11 +286,7 @@ class Situation:
         Returns:
             The step; without pairs where there is nothing to match.
         """
-        weights = dict(self.weights)
-        if not self.is_measured(number):
-            for name in self.anchored:
-                weights.pop(name, None)
-        return self.planner(number, weights).best_step(
+        return self.planner(number, self.weights_at(number)).best_step(
             number=number,
             level=self.levels[number],
             needless_after=self.needless_after(number),
@@ -308,24 +328,33 @@ def forecast_of(
     )
 
 
-def learned_step(situation: Situation) -> Step:
+def learned_step(situation: Situation, effort: EffortName) -> Step:
     """Return the pairs for learned matching.
 
-    Of a small set all of images to match again, and the others, too, where they take no longer
-    than the first model: models of learned matches alone need them. Of a larger set as many as
-    take what the first model took, the most promising ones.
+    Of a small set all of images that it may help, and the others, too, where they take no longer
+    than the first model: models of learned matches alone need them. None where it may bring next
+    to nothing. Of a larger set as many as take what the first model took, the most promising ones.
+
+    Args:
+        situation: what is known of the set.
+        effort: how long is tried.
     """
     number = situation.learned_level
     if number is None or not situation.weights:
         return Step()
     if not situation.is_small:
-        left_s = situation.first_model_s - situation.seconds_spent_at(number)
-        return situation.best_step(number, left_s)
+        spent_s = situation.seconds_spent_at(number) + situation.mapped_again_s
+        return situation.best_step(number, situation.first_model_s - spent_s)
+    weights = dict(situation.weights)
+    if EFFORTS[effort].gives_up:
+        weights = situation.weights_at(number)
+        if situation.registered and sum(weights.values()) < MIN_PHOTOGRAPHS:
+            return Step()
     lacking = situation.pairs_without_learned_matches()
     needed = list[Pair]()
     others = list[Pair]()
     for pair in lacking:
-        is_needed = not situation.weights.keys().isdisjoint(pair)
+        is_needed = not weights.keys().isdisjoint(pair)
         (needed if is_needed else others).append(pair)
     is_cheap = situation.seconds(number, (), others) <= situation.first_model_s
     return Step(number, lacking if needed and is_cheap else needed)
@@ -366,7 +395,7 @@ def next_step(
     budget_s = EFFORTS[effort].budget_s(situation.first_model_s, has_model=has_model)
     left_s = budget_s - situation.seconds_spent()
     if not situation.is_small:
-        learned = learned_step(situation)
+        learned = learned_step(situation, effort)
         if learned.pairs:
             return Plan(learned, max(0.0, left_s) + situation.first_model_s)
     hopeful = list[Step]()

@@ -227,9 +227,12 @@ class Search:
         straight = pycolmap.Reconstruction(as_it_is)
         was_bent = straighten(straight, self.adjuster.priors)
         adjuster = self.comparing().adjuster
-        cost = adjuster.adjust(as_it_is, FINAL)
-        straight_cost = adjuster.adjust(straight, FINAL) if was_bent else cost
-        return cost, straight_cost
+        models = [as_it_is, straight] if was_bent else [as_it_is]
+        adjusted = map_ordered(
+            lambda one: adjuster.adjust(one, FINAL), models, available_cores()
+        )
+        costs = list(adjusted)
+        return costs[0], costs[-1]
 
     def comparing(self) -> Self:
         """Return a search for models that are only compared: adjustments end earlier."""

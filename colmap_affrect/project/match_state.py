@@ -77,10 +77,15 @@ class MatchState:
     """What models of these matches are worth."""
     step: Begun | None = None
     """The step of escalation that has begun and not ended."""
-    has_stepped: bool = False
-    """Whether any step has begun."""
+    num_steps: int = 0
+    """Steps that have ended."""
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
+
+    @property
+    def has_stepped(self) -> bool:
+        """Whether any step has begun."""
+        return self.num_steps > 0 or self.step is not None
 
     def without_pairs(self, images: Collection[str] = ()) -> "MatchState":
         """Return what is left where pairs have gone: which ones escalate depends on all others.

@@ -15,7 +15,7 @@ from collections.abc import (
 )
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -443,6 +443,22 @@ class PreparedImage:
     is_part: bool  # there are more
 
 
+class _MadeOnce:
+    """An image that the first thread that needs it makes ready, while others may make others."""
+
+    def __init__(self, make: Callable[[], PreparedImage]) -> None:
+        self._make = make
+        self._lock = threading.Lock()
+        self._image: PreparedImage | None = None
+
+    def get(self) -> PreparedImage:
+        """Return the image; who comes meanwhile waits for it."""
+        with self._lock:
+            if self._image is None:
+                self._image = self._make()
+            return self._image
+
+
 class CachedMatcher:
     """Matches pairs, and keeps the images that it has prepared; a copy elsewhere has none."""
 
@@ -464,7 +480,7 @@ class CachedMatcher:
             matching.may_give_up,
         )
         self.matcher = MATCHERS.make(options, context)
-        self._images = lru_cache(matching.num_kept)(self._prepare)
+        self._images = lru_cache(matching.num_kept)(self._later)
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -486,9 +502,13 @@ class CachedMatcher:
         return PairMatches(names, indices, found.scores, first.end, level, is_of_some)
 
     def prepared(self, name: str) -> PreparedImage:
-        """Return an image ready for matching; made one at a time."""
-        with self._lock:
-            return self._images(name)
+        """Return an image ready for matching, made by the first thread that asks for it."""
+        with self._lock:  # by several threads a cache would make one twice
+            image = self._images(name)
+        return image.get()
+
+    def _later(self, name: str) -> _MadeOnce:
+        return _MadeOnce(partial(self._prepare, name))
 
     def _prepare(self, name: str) -> PreparedImage:
         matching = self._matching

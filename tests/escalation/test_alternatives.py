@@ -425,6 +425,9 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
+    context.matches.update_state(num_steps=1)
+    assert not escalation.plan_learned_matching()  # it was decided before that step
+    context.matches.update_state(num_steps=0)
     assert escalation.plan_learned_matching()
     monkeypatch.setattr(ImageSet, "weights", lambda *_: {})
     assert escalation.plan_learned_matching()

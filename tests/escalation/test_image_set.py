@@ -25,6 +25,7 @@ from colmap_affrect.mappers.wrong_models import (
     ThrownAway,
     write_thrown_away,
 )
+from colmap_affrect.project.match_state import MatchState
 from colmap_affrect.project.match_store import PairMatches
 from colmap_affrect.project.reasons import Doubt
 from colmap_affrect.project.report import SURE, ModelSummary
@@ -127,6 +128,7 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
     context.usable = lambda _: []
     context.num_verified_inliers = dict
     context.matches = SimpleNamespace(
+        state=MatchState(num_steps=2),
         levels=lambda *_: {},
         measured_worths=lambda _: {},
         learned_levels=lambda _: {},
@@ -134,6 +136,7 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
     found = state.situation({}, one_model())
     assert list(found.usable) == [1, 3]
     assert found.registered == ("a",)
+    assert found.num_steps == 2
 
 
 def one_model() -> list[ModelSummary]:

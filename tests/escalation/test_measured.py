@@ -120,6 +120,7 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
     escalation.match_at(own[2:], 1)
+    assert escalation.matches.state.num_steps == 1
     assert min(escalation.image_set.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 

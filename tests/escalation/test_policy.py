@@ -60,11 +60,11 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The others are matched, too, where that takes no longer than the first model."""
-    assert len(learned_step(situation()).pairs) == 10
+    assert len(learned_step(situation(), "normal").pairs) == 10
     monkeypatch.setattr(
         Situation, "first_model_s", 3 * statistics_of(LEVELS[LEARNED]).pair_s - 0.1
     )
-    step = learned_step(situation())
+    step = learned_step(situation(), "normal")
     assert step.level == LEARNED
     assert ["".join(pair) for pair in step.pairs] == [
         "ad",
@@ -75,8 +75,30 @@ def test_learned_matching_of_a_small_set_is_of_all_pairs_of_images_in_need(
         "ce",
         "de",
     ]
-    assert not learned_step(situation(weights="")).pairs
+    assert not learned_step(situation(weights=""), "normal").pairs
     assert not next_step(situation(weights=""), "high").step.pairs
+
+
+def test_images_that_measured_frames_tie_to_likely_ones_need_no_learned_matching(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Situation, "first_model_s", 0.0)
+    tied = situation(anchored="d", registered=list("abcd"))
+    needed = {"".join(pair) for pair in learned_step(tied, "normal").pairs}
+    assert needed == {"ae", "be", "ce", "de"}
+    assert len(learned_step(tied, "high").pairs) == 7
+
+
+@pytest.mark.parametrize(("weight", "num_pairs"), [(0.11, 7), (0.09, 0)])
+def test_learned_matching_must_be_likely_to_save_a_fifth_of_a_photograph(
+    monkeypatch: pytest.MonkeyPatch, weight: float, num_pairs: int
+) -> None:
+    monkeypatch.setattr(Situation, "first_model_s", 0.0)
+    unsure = replace(situation(), weights={"d": weight, "e": weight})
+    assert len(learned_step(unsure, "normal").pairs) == num_pairs
+    assert len(learned_step(unsure, "high").pairs) == 7
+    nothing = replace(unsure, registered=())
+    assert len(learned_step(nothing, "normal").pairs) == 7
 
 
 def test_pairs_that_have_learned_matches_used_or_not_get_no_others(
@@ -91,7 +113,7 @@ def test_pairs_that_have_learned_matches_used_or_not_get_no_others(
         0, 3, level=LEARNED, tried=0b111, measured_worth=(9, 0)
     )
     after = replace(before, states=states)
-    found = {"".join(pair) for pair in learned_step(after).pairs}
+    found = {"".join(pair) for pair in learned_step(after, "normal").pairs}
     assert found == {"be", "cd", "ce", "de"}
 
 
@@ -104,12 +126,36 @@ def test_strong_pairs_of_images_in_need_are_matched_by_networks_too(
     states = {
         pair: replace(state, num_inliers=500) for pair, state in strong.states.items()
     }
-    assert len(learned_step(replace(strong, states=states)).pairs) == 7
+    assert len(learned_step(replace(strong, states=states), "normal").pairs) == 7
 
 
 def with_state(given: Situation, pair: Pair, state: PairState) -> Situation:
     """Return a situation in which another state is known of a pair."""
     return replace(given, states={**given.states, pair: state})
+
+
+def test_mapping_after_each_step_counts_as_spent() -> None:
+    before = situation()
+    after = replace(before, num_steps=3)
+    assert after.seconds_spent() - before.seconds_spent() == pytest.approx(
+        3 * len(NAMES)
+    )
+
+
+def test_mapping_after_steps_of_learned_matching_is_of_its_time_on_larger_sets() -> (
+    None
+):
+    names = [f"{number:02}" for number in range(SMALL + 10)]
+    before = situation(names, weights=names[:9])
+    step = learned_step(replace(before, num_steps=9), "normal")
+    assert 0 < step.num_pairs < learned_step(before, "normal").num_pairs
+    left_s = before.first_model_s - 9 * before.mapping_s
+    assert step.all_seconds - before.mapping_s <= left_s
+    num_steps = int(before.first_model_s / before.mapping_s)
+    last = replace(before, num_steps=num_steps)
+    assert not learned_step(last, "normal").pairs
+    assert last.seconds_spent() == pytest.approx(0.0)
+    assert replace(last, num_steps=num_steps + 2).seconds_spent() > before.mapping_s
 
 
 def test_a_level_whose_matches_no_pair_uses_is_given_up_but_at_high_effort() -> None:
@@ -145,18 +191,23 @@ def test_models_that_have_become_worse_get_only_matches_that_are_there_already()
 
 
 def test_without_weights_other_levels_are_tried() -> None:
-    assert learned_step(situation(usable=[1, 3])).pairs == ()
+    assert learned_step(situation(usable=[1, 3]), "normal").pairs == ()
     assert next_step(situation(usable=[1, 3]), "normal").step.level in (1, 3)
 
 
 def test_learned_matching_of_a_large_set_takes_as_long_as_the_first_model() -> None:
     names = [f"{number:03}" for number in range(SMALL + 1)]
     large = situation(names, weights=names)
-    step = learned_step(large)
+    step = learned_step(large, "normal")
     assert 0 < len(step.pairs) < len(large.states)
     assert step.seconds <= large.first_model_s + len(names)
     assert (
-        len(learned_step(situation(names[:SMALL], weights=names[:SMALL])).pairs) == 435
+        len(
+            learned_step(
+                situation(names[:SMALL], weights=names[:SMALL]), "normal"
+            ).pairs
+        )
+        == 435
     )
 
 
@@ -175,7 +226,7 @@ def test_learned_matching_of_a_large_set_has_the_time_that_it_has_not_taken_yet(
         return Step()
 
     monkeypatch.setattr(Situation, "best_step", best_step)
-    learned_step(large)
+    learned_step(large, "normal")
     statistics = statistics_of(LEVELS[LEARNED])
     spent_s = 2 * statistics.image_s + statistics.pair_s
     assert asked == {"learned": pytest.approx(large.first_model_s - spent_s)}

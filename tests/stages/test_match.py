@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +83,27 @@ def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
     )
     assert matches(store) == expected
     assert len(NAMES) < len(reads) <= 3 * len(NAMES)
+
+
+def test_threads_make_each_image_ready_once_and_several_at_a_time(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both_at_work = threading.Barrier(2, timeout=20.0)
+    reads: list[str] = []
+    read = CachedMatcher._prepare
+
+    def counted(cache: CachedMatcher, name: str) -> stage.PreparedImage:
+        both_at_work.wait()
+        reads.append(name)
+        return read(cache, name)
+
+    monkeypatch.setattr(CachedMatcher, "_prepare", counted)
+    matcher = CachedMatcher(Matching(store, NearestOptions()))
+    wanted = [*NAMES[:2], *NAMES[:2]]
+    with ThreadPoolExecutor(len(wanted)) as threads:
+        images = list(threads.map(matcher.prepared, wanted))
+    assert sorted(reads) == sorted(NAMES[:2])
+    assert images[0] is images[2]
 
 
 def test_images_whose_features_have_gone_meanwhile_are_named(
