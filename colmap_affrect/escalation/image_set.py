@@ -4,7 +4,7 @@ It is read anew for every decision, from the stores and the view graph: each ste
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from colmap_affrect.colmap.connections import weakly_connected_images
 from colmap_affrect.escalation.expected_gain import PairState, insecure_images
@@ -77,11 +77,10 @@ class ImageSet:
         if not self._is_mapped():
             wanted = self._insecure(wanted, num_images=len(names))
         likely = frozenset[str]().union(*(model.likely for model in models))
-        gains = models[0].gains
         weights = dict[str, float]()
-        for name in sorted(wanted):
+        for name, gain in _gains(sorted(wanted), models).items():
             share = LIKELY if name in likely else 1.0
-            weights[name] = share * gains.get(name, 1.0)
+            weights[name] = share * gain
         return weights
 
     def _is_mapped(self) -> bool:
@@ -185,6 +184,7 @@ class ImageSet:
             usable=self.context.resources.usable_levels(extraction)[1:],
             states=states,
             weights=weights,
+            gains=_gains(weights, models),
             weakly_connected=self._weakly_connected(),
             anchored=self._anchored(models[0], states),
             megapixels=self._megapixels_by_level(sizes),
@@ -212,6 +212,16 @@ class ImageSet:
                 if number < len(by_level):
                     by_level[number].discard(name)
         return by_level
+
+
+def _gains(names: Iterable[str], models: Sequence[ModelSummary]) -> dict[str, float]:
+    """Return what more matches may bring to images, in photographs, by name.
+
+    Args:
+        names: of the images.
+        models: those that are there, the largest first.
+    """
+    return {name: models[0].gains.get(name, 1.0) for name in names}
 
 
 def _megapixels(size: Size, limit_px: int) -> float:

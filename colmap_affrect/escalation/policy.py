@@ -14,6 +14,7 @@ as any other.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -86,6 +87,10 @@ EFFORTS: Mapping[EffortName, Effort] = {
 }
 
 
+# Photographs that a second is worth: what all of the budget must bring at least
+PHOTOGRAPHS_PER_S = MIN_PHOTOGRAPHS / EFFORTS["normal"].least_s
+
+
 @dataclass(frozen=True)
 class Situation:
     """What is known of a set of images, as escalation sees it.
@@ -95,6 +100,7 @@ class Situation:
         usable: numbers of the levels of escalation that may be tried.
         states: of all pairs.
         weights: of the images to match again, in photographs.
+        gains: the same, what matches may bring to each, however likely that is.
         weakly_connected: images with few features in tracks through three.
         anchored: images of the model that measured frames connect to a likely one.
         megapixels: of each image, by level.
@@ -108,6 +114,7 @@ class Situation:
     usable: Sequence[int]
     states: Mapping[Pair, PairState]
     weights: Mapping[str, float]
+    gains: Mapping[str, float]
     weakly_connected: Collection[str]
     anchored: Collection[str]
     megapixels: Sequence[Mapping[str, float]]
@@ -140,6 +147,22 @@ class Situation:
             if state.learned_level < 0 and self.is_measured(state.level):
                 pairs.append(pair)
         return pairs
+
+    def images_worth_learned_matching(self, number: int) -> set[str]:
+        """Return the images to match again that gain what the time of their pairs is worth.
+
+        Args:
+            number: of the level that matches by networks.
+        """
+        pairs_of = defaultdict[str, list[Pair]](list)
+        for pair in self.pairs_without_learned_matches():
+            for name in pair:
+                pairs_of[name].append(pair)
+        images = set[str]()
+        for name, gain in self.gains.items():
+            if gain >= PHOTOGRAPHS_PER_S * self.seconds(number, (), pairs_of[name]):
+                images.add(name)
+        return images
 
     def seconds(
         self, number: int, names: Collection[str], pairs: Collection[Pair]
@@ -264,20 +287,11 @@ class Situation:
                 bits |= 1 << later
         return bits
 
-    def weights_at(self, number: int) -> dict[str, float]:
-        """Return the images that a level may help, and how much, in photographs.
+    def best_step(self, number: int, budget_s: float) -> Step:
+        """Return the best step of a level.
 
         Features without shapes mistake similar things for the same: images that others anchor do
         not need them.
-        """
-        weights = dict(self.weights)
-        if not self.is_measured(number):
-            for name in self.anchored:
-                weights.pop(name, None)
-        return weights
-
-    def best_step(self, number: int, budget_s: float) -> Step:
-        """Return the best step of a level.
 
         Args:
             number: of the level in the recipe.
@@ -286,7 +300,11 @@ class Situation:
         Returns:
             The step; without pairs where there is nothing to match.
         """
-        return self.planner(number, self.weights_at(number)).best_step(
+        weights = dict(self.weights)
+        if not self.is_measured(number):
+            for name in self.anchored:
+                weights.pop(name, None)
+        return self.planner(number, weights).best_step(
             number=number,
             level=self.levels[number],
             needless_after=self.needless_after(number),
@@ -331,9 +349,10 @@ def forecast_of(
 def learned_step(situation: Situation, effort: EffortName) -> Step:
     """Return the pairs for learned matching.
 
-    Of a small set all of images that it may help, and the others, too, where they take no longer
-    than the first model: models of learned matches alone need them. None where it may bring next
-    to nothing. Of a larger set as many as take what the first model took, the most promising ones.
+    Of a small set all of images to match again that are worth it, unless the effort gives up
+    nothing, and the others, too, where they take no longer than the first model: models of learned
+    matches alone need them. Of a larger set as many as take what the first model took, the most
+    promising ones.
 
     Args:
         situation: what is known of the set.
@@ -345,16 +364,14 @@ def learned_step(situation: Situation, effort: EffortName) -> Step:
     if not situation.is_small:
         spent_s = situation.seconds_spent_at(number) + situation.mapped_again_s
         return situation.best_step(number, situation.first_model_s - spent_s)
-    weights = dict(situation.weights)
+    images = set(situation.weights)
     if EFFORTS[effort].gives_up:
-        weights = situation.weights_at(number)
-        if situation.registered and sum(weights.values()) < MIN_PHOTOGRAPHS:
-            return Step()
+        images = situation.images_worth_learned_matching(number)
     lacking = situation.pairs_without_learned_matches()
     needed = list[Pair]()
     others = list[Pair]()
     for pair in lacking:
-        is_needed = not weights.keys().isdisjoint(pair)
+        is_needed = not images.isdisjoint(pair)
         (needed if is_needed else others).append(pair)
     is_cheap = situation.seconds(number, (), others) <= situation.first_model_s
     return Step(number, lacking if needed and is_cheap else needed)

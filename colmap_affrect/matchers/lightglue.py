@@ -31,11 +31,18 @@ from colmap_affrect.matchers.base import (
     MatcherOptions,
     Matches,
 )
+from colmap_affrect.matchers.cpu_products import (
+    fast_attention,
+    has_fast_products,
+    with_fast_products,
+)
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import one_openmp_thread
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
+
+    Attend = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 MIN_VIEW_FEATURES = 8
 """Features that a warp needs: matches of fewer could verify no two-view geometry (theory: the
@@ -124,7 +131,7 @@ class LightGlue:
         (key,) = options.weights
         network = load_network(context.weights[key], options)
         if self._device.type == "cpu":
-            fuse_cross_attention(network)
+            adapt_to_cpu(network)
         self._network = network.to(self._device)
         self._begin = split_off_beginning(self._network)
         self._gpu_lock = threading.Lock()
@@ -237,19 +244,30 @@ def load_network(path: Path, options: LightGlueOptions) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
-def fuse_cross_attention(network: Any) -> None:
-    """Have LightGlue attend from image to image by torch's fused attention, on a CPU, too.
+def adapt_to_cpu(network: Any) -> None:
+    """Have LightGlue multiply and attend as is fast on a CPU; results are the same to rounding.
 
-    kornia does so on GPUs alone. Elsewhere it holds the similarities of all pairs of features, for
-    which more than half of the time of a pair of images goes. Results are the same to rounding.
+    kornia attends from image to image by fused attention on GPUs alone. Elsewhere it holds the
+    similarities of all pairs of features, for which more than half of the time of a pair of images
+    goes.
 
     Args:
         network: kornia's; changed in place, where its blocks have the parts that are known.
     """
+    from torch.nn.functional import scaled_dot_product_attention
+
+    attend: Attend = scaled_dot_product_attention
+    is_fast = has_fast_products()
+    if is_fast:
+        attend = fast_attention
+        with_fast_products(network.transformers)
     for layer in network.transformers:
-        block = layer.cross_attn
-        if all(hasattr(block, part) for part in CROSS_BLOCK_PARTS):
-            block.forward = partial(_attend_across, block)
+        within = getattr(layer.self_attn, "inner_attn", None)
+        if is_fast and within is not None:
+            within.forward = _attend_within
+        across = layer.cross_attn
+        if all(hasattr(across, part) for part in CROSS_BLOCK_PARTS):
+            across.forward = partial(_attend_across, across, attend)
 
 
 def split_off_beginning(network: Any) -> Callable[[Mapping[str, Tensor]], Tensor]:
@@ -287,11 +305,22 @@ def split_off_beginning(network: Any) -> Callable[[Mapping[str, Tensor]], Tensor
     return begin
 
 
-def _attend_across(block: Any, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+def _attend_within(
+    queries: Tensor, keys: Tensor, values: Tensor, mask: None = None
+) -> Tensor:
+    """Do what the forward of kornia's ``Attention`` does; nothing is masked."""
+    del mask
+    return fast_attention(queries, keys, values)
+
+
+def _attend_across(
+    block: Any, attend: Attend, first: Tensor, second: Tensor
+) -> tuple[Tensor, Tensor]:
     """Do what the forward of kornia's ``CrossBlock`` does.
 
     Args:
         block: kornia's.
+        attend: as torch's ``scaled_dot_product_attention``.
         first: (B, N, D) descriptors of image 1.
         second: (B, M, D) descriptors of image 2.
 
@@ -299,13 +328,12 @@ def _attend_across(block: Any, first: Tensor, second: Tensor) -> tuple[Tensor, T
         Both with what they have learned of each other, (B, N, D) and (B, M, D).
     """
     import torch
-    from torch.nn.functional import scaled_dot_product_attention
 
     keys = [_by_head(block.to_qk(x), block.heads) for x in (first, second)]
     values = [_by_head(block.to_v(x), block.heads) for x in (first, second)]
     told = [
-        scaled_dot_product_attention(keys[0], keys[1], values[1]),
-        scaled_dot_product_attention(keys[1], keys[0], values[0]),
+        attend(keys[0], keys[1], values[1]),
+        attend(keys[1], keys[0], values[0]),
     ]
     found = []
     for descriptors, message in zip((first, second), told, strict=True):

@@ -21,11 +21,12 @@ from synthetic import unit_rows
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_lafs
+from colmap_affrect.matchers import lightglue
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, Matches
 from colmap_affrect.matchers.lightglue import (
     LightGlue,
     LightGlueOptions,
-    fuse_cross_attention,
+    adapt_to_cpu,
     load_network,
     merged_matches,
     network_inputs,
@@ -170,22 +171,34 @@ def test_threads_find_the_same(matcher: LightGlue) -> None:
         assert_array_equal(one.scores, other.scores)
 
 
+@pytest.mark.parametrize("is_fast", [False, True])
 @pytest.mark.parametrize("count", [5, 0])
-def test_fused_attention_tells_each_image_what_kornia_tells_it(count: int) -> None:
-    from kornia.feature.lightglue import CrossBlock
+def test_on_a_cpu_a_layer_tells_each_image_what_kornia_tells_it(
+    monkeypatch: pytest.MonkeyPatch, count: int, *, is_fast: bool
+) -> None:
+    from kornia.feature.lightglue import TransformerLayer
 
     torch.manual_seed(0)
-    block = CrossBlock(embed_dim=64, num_heads=2).eval()
+    layer = TransformerLayer(embed_dim=64, num_heads=2).eval().requires_grad_(False)
     first = torch.randn(1, 11, 64)
     second = torch.randn(1, count, 64)
-    expected = block(first, second)
-    network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
-    fuse_cross_attention(network)
-    fused = block(first, second)
-    assert block.forward is not type(block).forward
-    for found, known in zip(fused, expected, strict=True):
+    given = (
+        first,
+        second,
+        torch.randn(2, 1, 1, 11, 32),
+        torch.randn(2, 1, 1, count, 32),
+    )
+    expected = layer(*given)
+    monkeypatch.setattr(lightglue, "has_fast_products", lambda: is_fast)
+    adapt_to_cpu(SimpleNamespace(transformers=torch.nn.ModuleList([layer])))
+    adapted = layer(*given)
+    changed = {name for name, part in layer.named_modules() if "forward" in vars(part)}
+    linear = {"self_attn.inner_attn", "self_attn.Wqkv", "cross_attn.to_qk"}
+    assert changed >= {"cross_attn"}
+    assert changed.issuperset(linear) == is_fast
+    for found, known in zip(adapted, expected, strict=True):
         torch.testing.assert_close(found, known, atol=1e-5, rtol=1e-5)
-    assert (fused[0] - first).abs().max() > 0.1
+    assert (adapted[0] - first).abs().max() > 0.1
 
 
 def test_what_an_image_says_alone_is_asked_once_for_all_of_its_pairs(
@@ -229,10 +242,12 @@ def test_an_image_begins_once(
 
 
 def test_another_network_of_kornia_stays_as_it_is() -> None:
-    block = torch.nn.Linear(3, 3)
-    network = SimpleNamespace(transformers=[SimpleNamespace(cross_attn=block)])
-    fuse_cross_attention(network)
-    assert "forward" not in vars(block)
+    layer = torch.nn.Module()
+    layer.self_attn = torch.nn.ReLU()
+    layer.cross_attn = torch.nn.ReLU()
+    adapt_to_cpu(SimpleNamespace(transformers=torch.nn.ModuleList([layer])))
+    assert "forward" not in vars(layer.self_attn)
+    assert "forward" not in vars(layer.cross_attn)
 
 
 def test_features_of_another_extractor_are_refused_in_one_line(
