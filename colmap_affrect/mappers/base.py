@@ -145,7 +145,8 @@ class MappedModel:
     """The pairs by which all its images were found to be of one place; None where nothing has
     looked for places, or they are not clearly one."""
     add_last_points: Callable[[pycolmap.Reconstruction], None] | None = None
-    """Gives a reconstruction its last points and colours; called once, when images are scored."""
+    """Gives a reconstruction its last points and colours: this one, or a copy, perhaps in another
+    thread."""
 
     def first_by(self, hypothesis: str) -> MappedModel:
         """Return the model with the name of a hypothesis before those that it has."""

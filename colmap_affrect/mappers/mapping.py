@@ -22,6 +22,7 @@ from colmap_affrect.colmap.model_files import (
 )
 from colmap_affrect.errors import WorkspaceError, damage, how_to_make_again
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.last_points import LastPoints
 from colmap_affrect.mappers.other_cameras import OtherCameras
 from colmap_affrect.mappers.pair_graph import (
     MIN_NUM_MATCHES,
@@ -216,17 +217,19 @@ def map_database(
     least = max(1, min(least, int(ENOUGH_OF_SMALL_SET * num_images)))
     progress = _Progress(next_image, num_images)
     judged = _Judged(task, least)
+    last_points = LastPoints()
     try:
         with with_snapshots(task, mapper.options, snapshots, num_images) as whole:
             raw = partial / "raw"
             raw.mkdir(parents=True)
             found = mapper.map(whole, raw, mapper.options.random_seed, progress.show)
+            last_points.begin(found)
             judged.add(found)
             _map_without_false_pairs(mapper, judged, raw, progress)
             remove_own([raw])
         judged.kept.sort(key=lambda model: model.size, reverse=True)
         _pass_on_reasons(judged.scored, judged.kept)
-        summaries = _write_models(judged.kept, task, partial)
+        summaries = _write_models(judged.kept, task, last_points, partial)
         write_thrown_away(judged.thrown_away(), partial)
         remove_own([sparse_path])
         partial.rename(sparse_path)
@@ -356,21 +359,25 @@ def _remove_unfinished(partial: Path) -> None:
 
 
 def _write_models(
-    models: Sequence[ScoredModel], task: MappingTask, folder: Path
+    models: Sequence[ScoredModel],
+    task: MappingTask,
+    last_points: LastPoints,
+    folder: Path,
 ) -> list[ModelSummary]:
     """Write models, with their last points, and their summaries.
 
     Args:
         models: In the order of their numbers.
         task: What they were made from.
+        last_points: Adds these points.
         folder: Of the models.
     """
     summaries = list[ModelSummary]()
     for index, model in enumerate(models):
         path = folder / str(index)
-        if model.mapped.add_last_points:
-            model.mapped.add_last_points(model.mapped.reconstruction)
-        write_model(model.mapped.reconstruction, path)
+        finished = last_points.added_to(model.mapped)
+        model.mapped = replace(model.mapped, reconstruction=finished)
+        write_model(finished, path)
         summary = _summary(model, task)
         other = model.mapped.other_cameras
         findings = Findings(
