@@ -19,7 +19,7 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.by_hand import ByHand
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.escalation import alternatives, map_and_rematch
+from colmap_affrect.escalation import alternatives, image_set, map_and_rematch
 from colmap_affrect.escalation.alternatives import (
     SCORE,
     Choice,
@@ -465,6 +465,7 @@ def test_rematching_with_learned_matches_ends_and_does_nothing_when_run_again(
         return weights(state, models) or dict.fromkeys(NAMES, 1e-3)
 
     monkeypatch.setattr(ImageSet, "weights", unsure)
+    monkeypatch.setattr(image_set, "_gains", lambda names, _: dict.fromkeys(names, 1.0))
     monkeypatch.setattr(map_and_rematch, "has_models_to_go_on_from", lambda _: False)
     workspace = verified(photos, tmp_path / "out", recipe.name)
     context = Context(workspace)
