@@ -2,11 +2,11 @@
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
 from typing import TypeVar
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.parallel.executor import begin_in_thread
 from colmap_affrect.parallel.freed_memory import return_freed_memory
 
 Result = TypeVar("Result")
@@ -25,24 +25,21 @@ def run_cancellable(
     """Run ``call`` with a token in a thread; on Ctrl-C cancel it, and leave it if it goes on."""
     return_freed_memory()
     known = token or pycolmap.CancellationToken()
-    outcome: Future[Result] = Future()
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
     # the interpreter then ends under pycolmap's feet (bpo-45274).
     begun = threading.Event()
     ended = threading.Event()
 
-    def work() -> None:
+    def work() -> Result:
         begun.set()
         try:
-            outcome.set_result(call(known))
-        except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
-            outcome.set_exception(error)
+            return call(known)
         finally:
             ended.set()
 
     try:
         # In here, as Ctrl-C may come when it has just begun.
-        threading.Thread(target=work, daemon=True).start()
+        outcome = begin_in_thread(work)
         while not ended.wait(POLL_S):
             pass
     except KeyboardInterrupt:

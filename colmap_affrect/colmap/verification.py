@@ -40,8 +40,9 @@ TRIALS_PER_NEEDED_TRIAL = 1.0
 # with more 0.03 per cent; measured
 TRIALS_OF_FEW_INLIERS = 3.0
 MAX_FEW_INLIERS = 60  # measured
-# Raw matches of which fewer than half would be many inliers: as many samples at once are cheaper
-# then than few, and all of them once more; theory
+# Raw matches. With fewer, inliers are many only where they are more than half: such pairs are
+# searched by all samples at once, instead of by few and then by all. Of 300 verified pairs of four
+# scenes none is lost, in 0.83 of the time; measured
 MAX_FEW_MATCHES = 2 * MAX_FEW_INLIERS
 # Largest of the shares of inliers that samples must suffice for: by it a hundred homographies
 # are drawn, the fewest that COLMAP draws for any pair; theory
@@ -153,8 +154,8 @@ def _significant_geometry(
 ) -> pycolmap.TwoViewGeometry | None:
     """Return the two-view geometry of keypoints, of which those of a row match.
 
-    Few inliers are searched by more samples. They are rows, twice. None where there are too few of
-    them, or chance made them.
+    Pairs with few inliers are searched by more samples. The inliers are rows, twice. None where
+    there are too few of them, or chance made them.
     """
     search = _search_options(keypoints, options)
     has_few_matches = len(keypoints[0]) < MAX_FEW_MATCHES

@@ -63,18 +63,13 @@ def num_right_poses_now(context: Context) -> float:
     return num_right_poses(read_summaries(context.workspace.sparse))
 
 
-def _set_of(context: Context) -> str:
-    """Return a digest of the pairs that are listed, and of what is said by hand."""
-    return f"{context.matches.state.listed} {context.by_hand.digest()}"
-
-
 # Learned matches
 
 
 def learned_models_on_record(context: Context) -> LearnedModels | None:
     """Return what is on record of these pairs; None before learned matching."""
     known = context.matches.state.learned_models
-    return known if known and known.of_set == _set_of(context) else None
+    return known if known and known.of_set == context.set_digest() else None
 
 
 @dataclass(frozen=True)
@@ -102,7 +97,7 @@ def map_learned_matches(escalation: Escalation, mapper: Mapper) -> None:
     found = read_summaries(learned)
     names = set(context.features.names()).difference(context.by_hand.left_out)
     learned_models = LearnedModels(
-        of_set=_set_of(context),
+        of_set=context.set_digest(),
         score=num_right_poses(found),
         score_without=num_right_poses_now(context),
         is_of_most=2.0 * num_right_poses(found[:1]) > len(names) - 1,
@@ -118,7 +113,7 @@ def has_models_to_go_on_from(context: Context) -> bool:
 def give_up_learned_models(context: Context) -> None:
     """Put on record that there are no models of learned matches: they are expected to be worse."""
     score_without = num_right_poses_now(context)
-    learned_models = LearnedModels(_set_of(context), 0.0, score_without)
+    learned_models = LearnedModels(context.set_digest(), 0.0, score_without)
     context.matches.update_state(learned_models=learned_models)
 
 
@@ -268,7 +263,7 @@ def keep_best(context: Context) -> None:
             shutil.copytree(folder, new / folder.name)
         copy_thrown_away(workspace.sparse, new)
         shutil.copy(workspace.matches, new / workspace.matches.name)
-        kept = {"of_set": _set_of(context), "num_right_poses": present}
+        kept = {"of_set": context.set_digest(), "num_right_poses": present}
         write_sealed(new / SCORE, json.dumps(kept))
 
 
@@ -279,7 +274,7 @@ def num_right_poses_of_best(context: Context) -> float:
         return 0.0
     try:
         kept = read_sealed(path)
-        is_same = kept["of_set"] == _set_of(context)
+        is_same = kept["of_set"] == context.set_digest()
         return float(kept["num_right_poses"]) if is_same else 0.0
     except DAMAGE:
         return 0.0

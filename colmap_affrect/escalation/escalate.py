@@ -295,13 +295,20 @@ class Escalation:
             level: number of the level in the recipe.
         """
         if pairs:
-            self.matches.update_state(step=Begun(level, tuple(pairs)))
+            self._begin_step(Begun(level, tuple(pairs)))
         known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        num_steps = self.matches.state.num_steps + 1
-        self.matches.update_state(step=None, num_steps=num_steps)
+        self.matches.update_state(step=None)
+
+    def _begin_step(self, step: Begun) -> None:
+        """Put a step on record, and whether mapping follows it alone; it may have begun before."""
+        state = self.matches.state
+        rounds = state.rounds
+        if state.step is None and self.image_set.is_mapped():
+            rounds = (*rounds, step.level)
+        self.matches.update_state(step=step, rounds=rounds, has_stepped=True)
 
     def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
         """Use the learned matches of a level that are there already, where they are better.
@@ -337,28 +344,31 @@ class Escalation:
 
         Returns:
             Whether there are any; none of sets that are large or need nothing, where no learned
-            level can be used, and where it was not likely to help before the first step.
+            level can be used, and where no image was worth it when that was looked at first.
         """
         if self.matches.state.learned_matching:
             return True
         effort = self.context.effort
-        if self.has_stepped and EFFORTS[effort].gives_up:
+        present = self.context.set_digest()
+        was_declined = self.matches.state.not_worth_learning == present
+        if was_declined and EFFORTS[effort].gives_up:
             return False
         models = self.image_set.models()
         weights = self.image_set.weights(models)
         if not weights:
             return False
         situation = self.image_set.situation(weights, models)
-        if not situation.is_small:
+        if not situation.is_small or situation.learned_level is None:
             return False
         step = learned_step(situation, effort)
-        if step.pairs:
-            after = next_step(situation, effort)
-            self.context.progress.expect(after.left_s / available_cores())
-            self.matches.update_state(
-                learned_matching=Begun(step.level, tuple(step.pairs))
-            )
-        return bool(step.pairs)
+        if not step.pairs:
+            self.matches.update_state(not_worth_learning=present)
+            return False
+        after = next_step(situation, effort)
+        self.context.progress.expect(after.left_s / available_cores())
+        planned = Begun(step.level, tuple(step.pairs))
+        self.matches.update_state(learned_matching=planned)
+        return True
 
     def match_learned(self, *, only_verified: bool = False) -> int:
         """Match the pairs of :meth:`plan_learned_matching` that have no learned matches yet.

@@ -74,7 +74,7 @@ class ImageSet:
         names = set(self.context.features.names())
         names.difference_update(self.context.by_hand.left_out)
         wanted = names.difference(models[0].sure)
-        if not self._is_mapped():
+        if not self.is_mapped():
             wanted = self._insecure(wanted, num_images=len(names))
         likely = frozenset[str]().union(*(model.likely for model in models))
         weights = dict[str, float]()
@@ -83,7 +83,7 @@ class ImageSet:
             weights[name] = share * gain
         return weights
 
-    def _is_mapped(self) -> bool:
+    def is_mapped(self) -> bool:
         """Tell whether the models are those of the verified pairs."""
         return (
             self.context.workspace.model_inputs() == self.context.current_model_inputs()
@@ -191,7 +191,7 @@ class ImageSet:
             lacking=self._lacking_by_level(sizes),
             registered=models[0].registered_names,
             strong_num_inliers=self.options.strong_num_inliers,
-            num_steps=self.context.matches.state.num_steps,
+            rounds=self.context.matches.state.rounds,
         )
 
     def _megapixels_by_level(self, sizes: Mapping[str, Size]) -> list[dict[str, float]]:

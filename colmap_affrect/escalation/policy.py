@@ -1,13 +1,15 @@
 """What is matched again next, and when to stop: the policy of escalation, without its execution.
 
-1. Learned matching of whole photographs comes first, where its weights are there: it costs little
-   and helps where light, age or season differ. On small sets the verified
-   pairs of images to match again are matched by it, beside what is there
-   (:mod:`colmap_affrect.escalation.alternatives`), then all others, unless it ties these no better;
-   on other sets as many as take what the first model took.
+1. Learned matching of whole photographs comes first, where its weights are there: it helps where
+   light, age or season differ. On small sets it matches the pairs of images that may gain what the
+   time of their pairs is worth, beside what is there
+   (:mod:`colmap_affrect.escalation.alternatives`): the verified ones, then all others, unless it
+   ties these no better. On other sets as many pairs are matched as take what the first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
    nothing is likely to help. Levels that were in vain are given up, except with high effort.
+
+Mapping after each step counts as time spent.
 
 All seconds are nominal, of one core: a run that is killed and goes on, or a busy machine, decides
 as any other.
@@ -87,7 +89,7 @@ EFFORTS: Mapping[EffortName, Effort] = {
 }
 
 
-# Photographs that a second is worth: what all of the budget must bring at least
+# The least that a second must bring: as it is for all of the budget
 PHOTOGRAPHS_PER_S = MIN_PHOTOGRAPHS / EFFORTS["normal"].least_s
 
 
@@ -100,14 +102,14 @@ class Situation:
         usable: numbers of the levels of escalation that may be tried.
         states: of all pairs.
         weights: of the images to match again, in photographs.
-        gains: the same, what matches may bring to each, however likely that is.
+        gains: what matches may bring to each of these, also where it is likely right.
         weakly_connected: images with few features in tracks through three.
         anchored: images of the model that measured frames connect to a likely one.
         megapixels: of each image, by level.
         lacking: images without features of a level, by level.
         registered: images of the largest model.
         strong_num_inliers: pairs with as many inliers need nothing more.
-        num_steps: that were taken, each followed by mapping.
+        rounds: levels of the steps that mapping follows.
     """
 
     levels: Sequence[Level]
@@ -121,7 +123,7 @@ class Situation:
     lacking: Sequence[Collection[str]]
     registered: Collection[str] = ()
     strong_num_inliers: int = 100
-    num_steps: int = 0
+    rounds: Sequence[int] = ()
 
     @property
     def is_small(self) -> bool:
@@ -236,26 +238,28 @@ class Situation:
             names.update(pair)
         return self.seconds(number, names, pairs)
 
-    @property
-    def mapped_again_s(self) -> float:
-        """Nominal seconds of mapping after the steps so far."""
-        return self.num_steps * self.mapping_s
+    def seconds_mapped_after(self, number: int) -> float:
+        """Return the nominal seconds of mapping that followed steps of a level."""
+        return self.rounds.count(number) * self.mapping_s
 
     def seconds_spent(self) -> float:
-        """Return the nominal seconds spent after learned matching, of which some is free.
+        """Return the nominal seconds that escalation has taken, but for learned matching.
 
-        With mapping after each step: on sets of some size it takes as long as the step itself.
+        Mapping after steps counts: on sets of some size it takes as long as these. Of sets that
+        are not small, mapping after steps of learned matching is part of that, and of both only as
+        much is left out as the first model took.
         """
-        spent_s = self.mapped_again_s
+        spent_s = 0.0
         learned_s = 0.0
         for number in range(1, len(self.levels)):
-            seconds = self.seconds_spent_at(number)
-            spent_s += seconds
+            matched_s = self.seconds_spent_at(number)
+            mapped_s = self.seconds_mapped_after(number)
+            spent_s += matched_s + mapped_s
             if kind_of(self.levels[number]) == LEARNED:
-                learned_s += seconds
-        if self.is_small:
-            return spent_s - learned_s
-        return spent_s - min(learned_s + self.mapped_again_s, self.first_model_s)
+                learned_s += matched_s if self.is_small else matched_s + mapped_s
+        if not self.is_small:
+            learned_s = min(learned_s, self.first_model_s)
+        return spent_s - learned_s
 
     def planner(self, number: int, weights: Mapping[str, float]) -> StepPlanner:
         """Return what chooses the pairs of a level.
@@ -349,10 +353,10 @@ def forecast_of(
 def learned_step(situation: Situation, effort: EffortName) -> Step:
     """Return the pairs for learned matching.
 
-    Of a small set all of images to match again that are worth it, unless the effort gives up
-    nothing, and the others, too, where they take no longer than the first model: models of learned
-    matches alone need them. Of a larger set as many as take what the first model took, the most
-    promising ones.
+    Of a small set these are all pairs of images to match again that are worth it, or of all such
+    images where the effort gives up nothing. The other pairs are matched, too, where they take no
+    longer than the first model: models of learned matches alone need them. Of a larger set the most
+    promising pairs are matched, until they and mapping after them take what the first model took.
 
     Args:
         situation: what is known of the set.
@@ -362,7 +366,8 @@ def learned_step(situation: Situation, effort: EffortName) -> Step:
     if number is None or not situation.weights:
         return Step()
     if not situation.is_small:
-        spent_s = situation.seconds_spent_at(number) + situation.mapped_again_s
+        spent_s = situation.seconds_spent_at(number)
+        spent_s += situation.seconds_mapped_after(number)
         return situation.best_step(number, situation.first_model_s - spent_s)
     images = set(situation.weights)
     if EFFORTS[effort].gives_up:

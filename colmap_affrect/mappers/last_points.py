@@ -3,20 +3,18 @@
 Scoring takes images out of few models. The others have their last points when it ends.
 """
 
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from functools import partial
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappedModel
 from colmap_affrect.mappers.pair_graph import cameras_of, poses_of
-from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.parallel.executor import available_cores, begin_in_thread
 
 # Of a model that is copied, which takes memory; resource
 MAX_IMAGES = 100
 NUM_NORMALIZATIONS = 5  # of quaternions, whose last bits may change twice; numeric
-
-Added = Future[pycolmap.Reconstruction]
 
 
 class LastPoints:
@@ -24,7 +22,7 @@ class LastPoints:
 
     def __init__(self) -> None:
         """Begin with none."""
-        self._begun = list[tuple[list[bytes], Added]]()
+        self._begun = list[tuple[list[bytes], Future[pycolmap.Reconstruction]]]()
 
     def begin(self, models: Sequence[MappedModel]) -> None:
         """Begin with a copy of the first of some models, in another thread.
@@ -39,7 +37,8 @@ class LastPoints:
         add_points = models[0].add_last_points
         is_small = model.num_reg_images() <= MAX_IMAGES
         if add_points and is_small and available_cores() > 1:
-            added = _added_in_a_thread(add_points, pycolmap.Reconstruction(model))
+            copy = pycolmap.Reconstruction(model)
+            added = begin_in_thread(partial(_with_points, copy, add_points))
             self._begun.append((_content(model), added))
 
     def added_to(self, mapped: MappedModel) -> pycolmap.Reconstruction:
@@ -60,23 +59,13 @@ class LastPoints:
         return model
 
 
-def _added_in_a_thread(
-    add_points: Callable[[pycolmap.Reconstruction], None],
+def _with_points(
     model: pycolmap.Reconstruction,
-) -> Added:
-    """Add points to a model in a thread that nobody has to wait for."""
-    added = Added()
-
-    def work() -> None:
-        try:
-            add_points(model)
-            added.set_result(model)
-        except BaseException as error:  # noqa: BLE001  (raised where the points are asked for)
-            added.set_exception(error)
-
-    # Where a command ends meanwhile, this does not keep it.
-    threading.Thread(target=work, daemon=True).start()
-    return added
+    add_points: Callable[[pycolmap.Reconstruction], None],
+) -> pycolmap.Reconstruction:
+    """Return a model to which points were added."""
+    add_points(model)
+    return model
 
 
 def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:

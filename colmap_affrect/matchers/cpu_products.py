@@ -1,7 +1,7 @@
 """Products of floats on a CPU, by oneDNN instead of by the library that torch was built with.
 
 That is MKL in torch's own packages, which does not use AVX-512 on processors of AMD: oneDNN takes
-half the time there, and as long as MKL on others. Results are the same to rounding.
+half the time there. Results are the same to rounding.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def with_fast_products(network: nn.Module) -> None:
     """
     from torch import nn
 
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            module.forward = partial(_linear, module)  # type: ignore[method-assign]
+    layers: list[Any] = [m for m in network.modules() if isinstance(m, nn.Linear)]
+    for layer in layers:
+        layer.forward = partial(_linear, layer)
 
 
 def _linear(layer: nn.Linear, given: Tensor) -> Tensor:
@@ -76,7 +76,7 @@ def fast_attention(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
     size, num_heads, num_queries, length = queries.shape
     num_keys = keys.shape[2]
     scaled = queries * length**-0.5
-    found = torch.zeros((size, num_heads, num_queries, values.shape[3]))
+    found = queries.new_zeros((size, num_heads, num_queries, values.shape[3]))
     if not num_keys:
         return found
     for batch in range(size):

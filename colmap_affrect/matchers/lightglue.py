@@ -262,12 +262,12 @@ def adapt_to_cpu(network: Any) -> None:
         attend = fast_attention
         with_fast_products(network.transformers)
     for layer in network.transformers:
-        within = getattr(layer.self_attn, "inner_attn", None)
-        if is_fast and within is not None:
-            within.forward = _attend_within
-        across = layer.cross_attn
-        if all(hasattr(across, part) for part in CROSS_BLOCK_PARTS):
-            across.forward = partial(_attend_across, across, attend)
+        attention = getattr(layer.self_attn, "inner_attn", None)
+        if is_fast and attention is not None:
+            attention.forward = _attend_within
+        block = layer.cross_attn
+        if all(hasattr(block, part) for part in CROSS_BLOCK_PARTS):
+            block.forward = partial(_attend_across, block, attend)
 
 
 def split_off_beginning(network: Any) -> Callable[[Mapping[str, Tensor]], Tensor]:
@@ -306,10 +306,11 @@ def split_off_beginning(network: Any) -> Callable[[Mapping[str, Tensor]], Tensor
 
 
 def _attend_within(
-    queries: Tensor, keys: Tensor, values: Tensor, mask: None = None
+    queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None
 ) -> Tensor:
-    """Do what the forward of kornia's ``Attention`` does; nothing is masked."""
-    del mask
+    """Do what the forward of kornia's ``Attention`` does where nothing is masked."""
+    if mask is not None:
+        raise NotImplementedError("fast attention masks nothing")
     return fast_attention(queries, keys, values)
 
 

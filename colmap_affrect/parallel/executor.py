@@ -6,9 +6,10 @@ a cluster (:mod:`colmap_affrect.parallel.cluster`). Results do not depend on it.
 
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -110,6 +111,27 @@ def one_openmp_thread() -> Iterator[None]:
     """
     with _loaded_libraries().limit(limits=1, user_api="openmp"):
         yield
+
+
+def begin_in_thread(call: Callable[[], Result]) -> "Future[Result]":
+    """Begin a call in a thread of its own, which does not keep a program from ending.
+
+    Args:
+        call: what is done there.
+
+    Returns:
+        What it returns or raises, to whoever asks for it.
+    """
+    outcome = Future[Result]()
+
+    def work() -> None:
+        try:
+            outcome.set_result(call())
+        except BaseException as error:  # noqa: BLE001  (raised where it is asked for)
+            outcome.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return outcome
 
 
 def map_ordered(

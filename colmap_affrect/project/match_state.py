@@ -33,7 +33,7 @@ class Begun:
 class LearnedModels:
     """What models of learned matches are worth."""
 
-    of_set: str  # digest of the pairs, and of what is said by hand
+    of_set: str  # its digest
     score: float  # 0 where there are none
     score_without: float  # of the first models
     is_of_most: bool = False  # most poses are expected to be right in one of them
@@ -75,17 +75,16 @@ class MatchState:
     """What learned matching is for, whose matches are kept beside those in use."""
     learned_models: LearnedModels | None = None
     """What models of these matches are worth."""
+    not_worth_learning: str = ""
+    """Digest of the set of which no photograph was worth learned matching, before any step."""
     step: Begun | None = None
     """The step of escalation that has begun and not ended."""
-    num_steps: int = 0
-    """Steps that have ended."""
+    has_stepped: bool = False
+    """Whether any step has begun."""
+    rounds: tuple[int, ...] = ()
+    """Levels of the steps that began when all was mapped: mapping follows each of them."""
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
-
-    @property
-    def has_stepped(self) -> bool:
-        """Whether any step has begun."""
-        return self.num_steps > 0 or self.step is not None
 
     def without_pairs(self, images: Collection[str] = ()) -> "MatchState":
         """Return what is left where pairs have gone: which ones escalate depends on all others.

@@ -309,6 +309,10 @@ class Context:
             return PairList.of(())
         return lists.read_pairs_once(path, names)
 
+    def set_digest(self) -> str:
+        """Return a digest of the pairs that are listed, and of what is said by hand."""
+        return f"{self.matches.state.listed} {self.by_hand.digest()}"
+
     def usable(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Return the pairs whose images the database has, but those rejected by hand."""
         ids = self.graph.ids

@@ -503,7 +503,7 @@ class CachedMatcher:
 
     def prepared(self, name: str) -> PreparedImage:
         """Return an image ready for matching, made by the first thread that asks for it."""
-        with self._lock:  # by several threads a cache would make one twice
+        with self._lock:  # the cache may call for a name twice otherwise
             image = self._images(name)
         return image.get()
 

@@ -148,7 +148,7 @@ def spent(context: Context) -> Row:
     learned_models = context.matches.state.learned_models
     return {
         "first_model_s": round(situation.first_model_s, 1),
-        "spent_s": round(situation.spent_s(), 1),
+        "spent_s": round(situation.seconds_spent(), 1),
         "pairs": {
             name: sum(state.tried >> number & 1 for state in situation.states.values())
             for number, name in enumerate(names)

@@ -45,7 +45,7 @@ from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.sealed_json import write_sealed
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
-from colmap_affrect.session.context import Context
+from colmap_affrect.session.context import Context, Resources
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 
@@ -425,9 +425,6 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     context.matches.remove(pairs=pairs)
     match(context)
     escalation.write()
-    context.matches.update_state(num_steps=1)
-    assert not escalation.plan_learned_matching()  # it was decided before that step
-    context.matches.update_state(num_steps=0)
     assert escalation.plan_learned_matching()
     monkeypatch.setattr(ImageSet, "weights", lambda *_: {})
     assert escalation.plan_learned_matching()
@@ -437,6 +434,45 @@ def test_learning_that_was_killed_goes_on_with_the_same_pairs(
     monkeypatch.setattr(Escalation, "is_over_time", False)
     assert escalation.match_learned() == len(pairs)
     assert escalation.has_all_learned_matches
+
+
+def without_learned_matches(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> Escalation:
+    """Return an escalation of photographs that all need something, none of it tried."""
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
+    escalation = escalation_of(context)
+    context.matches.remove(pairs=list(escalation.image_set.pairs))
+    match(context)
+    escalation.write()
+    return escalation
+
+
+def test_weights_that_are_installed_after_steps_bring_learned_matching(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = without_learned_matches(context, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(Resources, "usable_levels", lambda *_: [0])
+        assert not escalation.plan_learned_matching()
+        context.matches.update_state(has_stepped=True, rounds=(2,))
+    assert escalation.plan_learned_matching()
+
+
+def test_learned_matching_that_was_of_no_worth_before_any_step_is_of_none_later(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a run that was killed would decide otherwise than one that goes through."""
+    escalation = without_learned_matches(context, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(image_set, "_gains", lambda names, _: dict.fromkeys(names, 0.0))
+        assert not escalation.plan_learned_matching()
+    assert not escalation.plan_learned_matching()
+    high = escalation_of(replace(context, effort="high"))
+    assert high.plan_learned_matching()
+    context.matches.update_state(learned_matching=None)
+    said = replace(context, by_hand=ByHand(left_out=(NAMES[0],)))
+    assert escalation_of(said).plan_learned_matching()
 
 
 def test_matches_of_pairs_that_are_removed_take_learned_ones_along(
@@ -559,15 +595,14 @@ def interrupted_at_third_call() -> Callable[[Escalation], None]:
 def test_an_edited_score_of_the_best_models_does_not_count(tmp_path: Path) -> None:
     context = Mock()
     context.workspace.best = tmp_path
-    context.matches.state.listed = "pairs"
-    context.by_hand.digest.return_value = "by hand"
-    kept = {"of_set": "pairs by hand", "num_right_poses": 2.5}
+    context.set_digest.return_value = "set"
+    kept = {"of_set": "set", "num_right_poses": 2.5}
     write_sealed(tmp_path / SCORE, json.dumps(kept))
     assert num_right_poses_of_best(context) == 2.5
     text = (tmp_path / SCORE).read_text(encoding="utf-8")
     for edited in ("1e9", "NaN", "Infinity", '"x"', "[]"):
         (tmp_path / SCORE).write_text(text.replace("2.5", edited), encoding="utf-8")
         assert num_right_poses_of_best(context) == 0.0
-    context.matches.state.listed = "others"
+    context.set_digest.return_value = "another set"
     write_sealed(tmp_path / SCORE, json.dumps(kept))
     assert num_right_poses_of_best(context) == 0.0

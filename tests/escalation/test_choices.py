@@ -16,7 +16,6 @@ from colmap_affrect.escalation.alternatives import (
     SCORE,
     Choice,
     _choice_of_learned_matches,
-    _set_of,
     give_up_learned_models,
     has_models_to_go_on_from,
     keep_best,
@@ -52,9 +51,8 @@ def context_in(folder: Path, **state: Any) -> Any:
         workspace=workspace,
         current_model_inputs=lambda: "these",
         features=SimpleNamespace(names=lambda: NAMES),
-        by_hand=SimpleNamespace(
-            digest=lambda: "", allows=lambda *pair: pair != ("a", "c")
-        ),
+        by_hand=SimpleNamespace(allows=lambda *pair: pair != ("a", "c")),
+        set_digest=lambda: "set",
         matches=SimpleNamespace(state=MatchState(listed="pairs", **state)),
     )
 
@@ -71,8 +69,7 @@ def test_learned_models_are_needed_where_more_of_their_poses_are_right(
     now: float, *, is_needed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     context = context_in(tmp_path)
-    of_set = _set_of(context)
-    learned = LearnedModels(of_set, score=3.0, score_without=1.0)
+    learned = LearnedModels("set", score=3.0, score_without=1.0)
     context.matches.state = MatchState(listed="pairs", learned_models=learned)
     let_models_have(now, monkeypatch)
     assert needs_learned_models(context) == is_needed
@@ -159,8 +156,7 @@ def test_best_models_of_other_pairs_are_worth_nothing(tmp_path: Path) -> None:
     context = context_in(tmp_path)
     context.workspace.best.mkdir()
     score = context.workspace.best / SCORE
-    of_set = _set_of(context)
-    write_sealed(score, json.dumps({"of_set": of_set, "num_right_poses": 2.5}))
+    write_sealed(score, json.dumps({"of_set": "set", "num_right_poses": 2.5}))
     assert num_right_poses_of_best(context) == 2.5
     write_sealed(score, json.dumps({"of_set": "others", "num_right_poses": 2.5}))
     assert num_right_poses_of_best(context) == 0.0

@@ -128,7 +128,7 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
     context.usable = lambda _: []
     context.num_verified_inliers = dict
     context.matches = SimpleNamespace(
-        state=MatchState(num_steps=2),
+        state=MatchState(rounds=(3, 1)),
         levels=lambda *_: {},
         measured_worths=lambda _: {},
         learned_levels=lambda _: {},
@@ -136,7 +136,7 @@ def test_the_level_of_every_image_is_none_that_is_tried_again() -> None:
     found = state.situation({}, one_model())
     assert list(found.usable) == [1, 3]
     assert found.registered == ("a",)
-    assert found.num_steps == 2
+    assert found.rounds == (3, 1)
 
 
 def one_model() -> list[ModelSummary]:

@@ -12,6 +12,7 @@ from verified import copy_of, verified
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.escalation.escalate import Escalation
 from colmap_affrect.escalation.expected_gain import Step
+from colmap_affrect.escalation.image_set import ImageSet
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.match_state import Worth
 from colmap_affrect.project.match_store import PairMatches
@@ -113,14 +114,17 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
+        patch.setattr(ImageSet, "is_mapped", lambda _: True)
         patch.setattr(escalation.matches, "write", killed)
         with pytest.raises(KeyboardInterrupt):
             escalation.match_at(own, 1)
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
-    escalation.match_at(own[2:], 1)
-    assert escalation.matches.state.num_steps == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(ImageSet, "is_mapped", lambda _: True)
+        escalation.match_at(own[2:], 1)
+    assert escalation.matches.state.rounds == (1,)  # it is one step
     assert min(escalation.image_set.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
 
@@ -131,6 +135,7 @@ def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
     escalation = escalation_of(context)
     last = NAMES[3]
     escalation.match_at(without_matches(context, last), 1)
+    assert not escalation.matches.state.rounds  # nothing was mapped before
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
     _, models = stage.map_images(context, mapper)
     assert models[0].registered_names == tuple(sorted(NAMES))

@@ -129,7 +129,7 @@ def with_state(given: Situation, pair: Pair, state: PairState) -> Situation:
 
 def test_mapping_after_each_step_counts_as_spent() -> None:
     before = situation()
-    after = replace(before, num_steps=3)
+    after = replace(before, rounds=[1, LEARNED, 1])
     assert after.seconds_spent() - before.seconds_spent() == pytest.approx(
         3 * len(NAMES)
     )
@@ -140,14 +140,18 @@ def test_mapping_after_steps_of_learned_matching_is_of_its_time_on_larger_sets()
 ):
     names = [f"{number:02}" for number in range(SMALL + 10)]
     before = situation(names, weights=names[:9])
-    step = learned_step(replace(before, num_steps=9), "normal")
+    step = learned_step(replace(before, rounds=9 * [LEARNED]), "normal")
     assert 0 < step.num_pairs < learned_step(before, "normal").num_pairs
     left_s = before.first_model_s - 9 * before.mapping_s
     assert step.all_seconds - before.mapping_s <= left_s
-    last = replace(before, num_steps=11)  # 440 of 432 seconds
+    last = replace(before, rounds=11 * [LEARNED])  # 440 of 432 seconds
     assert not learned_step(last, "normal").pairs
-    assert replace(before, num_steps=10).seconds_spent() == pytest.approx(0.0)
+    ten = replace(before, rounds=10 * [LEARNED])
+    assert ten.seconds_spent() == pytest.approx(0.0)
     assert last.seconds_spent() == pytest.approx(8.0)
+    others = replace(before, rounds=9 * [1])
+    assert learned_step(others, "normal") == learned_step(before, "normal")
+    assert others.seconds_spent() == pytest.approx(360.0)
 
 
 def test_a_level_whose_matches_no_pair_uses_is_given_up_but_at_high_effort() -> None:

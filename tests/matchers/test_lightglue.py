@@ -178,6 +178,8 @@ def test_on_a_cpu_a_layer_tells_each_image_what_kornia_tells_it(
 ) -> None:
     from kornia.feature.lightglue import TransformerLayer
 
+    if is_fast and not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
+        pytest.skip("torch without oneDNN")
     torch.manual_seed(0)
     layer = TransformerLayer(embed_dim=64, num_heads=2).eval().requires_grad_(False)
     first = torch.randn(1, 11, 64)
