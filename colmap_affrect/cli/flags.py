@@ -141,8 +141,8 @@ FLAGS: dict[str, Settings] = {
     "--set": _value("SECTION.OPTION=VALUE", "change one option of the recipe, e.g. --set "
         "rectifier.tilt_radius=1.8; may be repeated", action="append", default=[]),
     "--effort": _value("EFFORT", "how much is tried for photographs that are missing or doubtful "
-        "in the first model: low ends after learned matching, normal adds what is likely to help for "
-        "about as long as the first model took, a minute at least, high for five times as long "
+        "in the first model: low ends after learned matching, normal adds what is likely to help "
+        "for about as long as the first model took, a minute at least, high for five times as long "
         "(default: normal)", choices=EFFORT_NAMES, default="normal"),
     "--max-time": _value("MINUTES", "match nothing again after so long, whatever the effort; the "
         "same command goes on (default: no limit)", type=minutes, default=math.inf,

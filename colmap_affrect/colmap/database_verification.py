@@ -27,6 +27,9 @@ Frames = tuple[Floats, Floats]
 PAIRS_PER_WRITE = 100  # a run that is ended loses at most as many; resource
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
+# Pairs that are verified meanwhile where one takes far longer than others; resource
+PAIRS_AHEAD = 16
+
 ExtractedPx = int | Mapping[tuple[int, int], int] | None
 """Longest side that photographs were shrunk to, if any; or by pair of image ids, lower first."""
 
@@ -143,7 +146,7 @@ def verify_pairs(
         advance: is called with the number of pairs that are done.
         executor: where pairs are verified, e.g. a cluster; None: threads here.
     """
-    executor = executor or Threads(available_cores())
+    executor = executor or Threads(available_cores(), PAIRS_AHEAD)
     cameras = colmap_database.cameras_of_images(database)
 
     @lru_cache(NUM_CACHED_IMAGES)

@@ -6,7 +6,9 @@ optical axes are in the middle.
 
 import logging
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import partial
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError
@@ -20,6 +22,7 @@ from colmap_affrect.mappers.own_cameras import (
     OwnCameras,
     one_camera,
     own_cameras,
+    trial_with_own_cameras,
     with_per_image_cameras,
 )
 from colmap_affrect.mappers.pair_graph import Ids, has_rigs
@@ -35,6 +38,11 @@ from colmap_affrect.mappers.rigs import COLMAP_MODEL
 from colmap_affrect.mappers.search import Search, with_new_images
 from colmap_affrect.mappers.some_tracks import model_of_some_tracks
 from colmap_affrect.mappers.tie_joining import TieJoiner
+from colmap_affrect.parallel.executor import (
+    available_cores,
+    begin_in_thread,
+    map_ordered,
+)
 
 # What made a model, in the words of a report.
 # Others also verify sides that look the same
@@ -83,6 +91,8 @@ class HypothesisTest:
         self.per_image = per_image
         # The model whose images shared cameras, and by what it scored lower
         self.replaced: tuple[pycolmap.Reconstruction, float] | None = None
+        # A trial with own cameras that has begun, of the model that is being made
+        self.begun: Future[pycolmap.Reconstruction] | None = None
         # The last model that was tried with own cameras, and what these make of it
         self.tried: tuple[pycolmap.Reconstruction, OwnCameras] | None = None
         self._begin_with_cameras_of(task.previous_models)
@@ -133,7 +143,8 @@ class HypothesisTest:
         """
         graph = self.search.graph.without(hypothesis.left_out)
         if not self.best:
-            models = model_of_some_tracks(self.search, graph)
+            begin_trial = partial(self._begin_trial_with_own_cameras, hypothesis)
+            models = model_of_some_tracks(self.search, graph, begin_trial)
             models = models or self.search.best(graph)
             return [mapped.first_by(hypothesis.name) for mapped in models]
         if not graph.unexplained_by(self.best[0].reconstruction):
@@ -166,9 +177,9 @@ class HypothesisTest:
             return
         models.sort(key=lambda mapped: -mapped.reconstruction.num_reg_images())
         grower = search.grower(search.graph)
-        found = list[MappedModel]()
-        for mapped in models[:NUM_COLMAP_MODELS]:
-            found.append(MappedModel(grower.remake(mapped.reconstruction)))
+        given = [mapped.reconstruction for mapped in models[:NUM_COLMAP_MODELS]]
+        remade = map_ordered(grower.remake, given, available_cores())
+        found = [MappedModel(model) for model in remade]
         found.sort(key=lambda mapped: search.best_score([mapped]), reverse=True)
         found = search.with_bridges(search.graph, found)
         score = search.best_score(found)
@@ -251,7 +262,18 @@ class HypothesisTest:
         """Return a model with a camera for each image, made from some of the tracks at least."""
         if self.tried and self.tried[0] is model:
             return self.tried[1].trial
-        return own.comparing().grower(own.graph.thinned()).restart_from(model)
+        return trial_with_own_cameras(own, own.graph, model)
+
+    def _begin_trial_with_own_cameras(
+        self, hypothesis: _Hypothesis, model: pycolmap.Reconstruction
+    ) -> None:
+        """Try a model with a camera for each image, in a thread, while it gets all points."""
+        if self.per_image:
+            graph = self.per_image.graph.without(hypothesis.left_out)
+            copied = pycolmap.Reconstruction(model)
+            self.begun = begin_in_thread(
+                partial(trial_with_own_cameras, self.per_image, graph, copied)
+            )
 
     def _take_shifted_axes(self, free: Search) -> bool:
         """Take the best model with free principal points where it scores higher; tell whether."""
@@ -278,8 +300,13 @@ class HypothesisTest:
         first = self.best[0]
         graph = self.per_image.graph.without(hypothesis.left_out)
         own = with_per_image_cameras(
-            self.per_image, graph, self.search, first.reconstruction
+            per_image=self.per_image,
+            graph=graph,
+            shared=self.search,
+            model=first.reconstruction,
+            known=self.begun.result() if self.begun else None,
         )
+        self.begun = None
         self.tried = first.reconstruction, own
         model = own.whole
         if model is None:

@@ -83,8 +83,19 @@ def one_camera(
     return OtherCameras(worth - gain, turns_deg, are_shared=True)
 
 
+def trial_with_own_cameras(
+    per_image: Search, graph: PairGraph, model: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """Return a model with a camera for each image, from some of the tracks; the other one stays."""
+    return per_image.comparing().grower(graph.thinned()).restart_from(model)
+
+
 def with_per_image_cameras(
-    per_image: Search, graph: PairGraph, shared: Search, model: pycolmap.Reconstruction
+    per_image: Search,
+    graph: PairGraph,
+    shared: Search,
+    model: pycolmap.Reconstruction,
+    known: pycolmap.Reconstruction | None = None,
 ) -> OwnCameras:
     """Give each image of a model a camera of its own.
 
@@ -93,12 +104,13 @@ def with_per_image_cameras(
         graph: Its pairs.
         shared: Scores the model with shared cameras.
         model: The model with shared cameras; it stays as it is.
+        known: What :func:`trial_with_own_cameras` made of it, if it did; it may be changed.
     """
     is_looked_at = model.num_reg_images() <= MAX_OPEN_IMAGES
     thin = graph.thinned()
     if thin is not graph:
         grower = per_image.comparing().grower(thin)
-        trial = grower.restart_from(model)
+        trial = known or trial_with_own_cameras(per_image, graph, model)
         scorer = replace(per_image.scorer, graph=thin)
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if scorer.score(trial) <= shared_score + MIN_SCORE_GAIN:

@@ -103,9 +103,7 @@ class Search:
                     pending.insert(0, self._with_focals_of(model))
             if self.is_certain(model, graph, focals_agree=attempt.focals_agree):
                 break
-        grower = self.grower(graph)
-        for mapped in best.models:
-            grower.adjust_fully(mapped.reconstruction)
+        _adjust_fully(self.grower(graph), best.models)
         return best.models
 
     def _lacks_bridges(
@@ -140,8 +138,7 @@ class Search:
         models += grown
         models.sort(key=self._score, reverse=True)
         found = search.with_bridges(graph, models)
-        for mapped in found:
-            grower.adjust_fully(mapped.reconstruction)
+        _adjust_fully(grower, found)
         return found
 
     def with_bridges(
@@ -164,9 +161,11 @@ class Search:
             return with_new_images(models)
         grower = self.grower(graph)
         bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
-        joined = list[MappedModel]()
-        for mapped in models[: self.num_bridged_models]:
-            joined.append(register_bridges(mapped, bridges, grower, self.scorer))
+        joined = map_ordered(
+            lambda mapped: register_bridges(mapped, bridges, grower, self.scorer),
+            models[: self.num_bridged_models],
+            available_cores(),
+        )
         return with_new_images([max(joined, key=self._score), *models])
 
     def is_certain(
@@ -353,6 +352,13 @@ class Search:
                 if is_complete and self.scorer.is_confirmed(model):
                     break
         return best.ranked()
+
+
+def _adjust_fully(grower: Grower, models: Iterable[MappedModel]) -> None:
+    """Adjust models in threads until they converge."""
+    reconstructions = [mapped.reconstruction for mapped in models]
+    for _ in map_ordered(grower.adjust_fully, reconstructions, available_cores()):
+        pass
 
 
 class _BestModels:

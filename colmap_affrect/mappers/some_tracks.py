@@ -44,12 +44,17 @@ SELDOM: Mapping[str, Plain] = {
 """Options of COLMAP's pipeline for large sets, whose time then grows as their images do."""
 
 
-def model_of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
+def model_of_some_tracks(
+    search: Search,
+    graph: PairGraph,
+    before_all_points: Callable[[pycolmap.Reconstruction], None],
+) -> list[MappedModel]:
     """Return the model that some tracks of a graph make, with all points, if it is certain.
 
     Args:
         search: Makes and scores models.
         graph: The pairs that a model is made from.
+        before_all_points: Called with the model before it gets all points.
 
     Returns:
         One model, or none.
@@ -66,6 +71,7 @@ def model_of_some_tracks(search: Search, graph: PairGraph) -> list[MappedModel]:
     has_all = model.num_reg_images() == len(search.graph.keypoints)
     if not has_all or not quick.is_certain(model, search.graph):
         return []
+    before_all_points(model)
     return [_with_all_points(search, graph, models[0])]
 
 

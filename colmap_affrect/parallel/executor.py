@@ -49,9 +49,15 @@ class Executor(Protocol):
 
 @dataclass(frozen=True)
 class Threads:
-    """Work in threads of this process."""
+    """Work in threads of this process.
+
+    Attributes:
+        num_threads: that work.
+        num_ahead: tasks that may be in flight besides two per thread.
+    """
 
     num_threads: int
+    num_ahead: int = 0
 
     def map(
         self,
@@ -67,7 +73,7 @@ class Threads:
             files: what the function reads, which this process sees.
         """
         del files
-        return map_ordered(function, tasks, self.num_threads)
+        return map_ordered(function, tasks, self.num_threads, self.num_ahead)
 
 
 def available_cores() -> int:
@@ -135,7 +141,10 @@ def begin_in_thread(call: Callable[[], Result]) -> "Future[Result]":
 
 
 def map_ordered(
-    function: Callable[[Task], Result], tasks: Iterable[Task], num_threads: int
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    num_threads: int,
+    num_ahead: int = 0,
 ) -> Generator[Result, None, None]:
     """Yield the results of tasks in their order; at most two tasks per thread are in flight.
 
@@ -148,6 +157,7 @@ def map_ordered(
         function: does a task, in one of the threads.
         tasks: they are taken when their turn comes, in the calling thread.
         num_threads: that work.
+        num_ahead: tasks that may be in flight besides.
 
     Raises:
         Exception: what the function raises, at the place of its task.
@@ -161,7 +171,7 @@ def map_ordered(
             yield from in_order(
                 lambda task: pool.submit(function, task),
                 tasks,
-                limit=lambda: 2 * num_threads,
+                limit=lambda: 2 * num_threads + num_ahead,
             )
     except KeyboardInterrupt:
         is_waited_for = False

@@ -13,13 +13,19 @@ from mapping_tasks import mapper_of, synthesize
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.mappers import hypotheses
+from colmap_affrect.mappers import hypotheses, own_cameras
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.other_cameras import OtherCameras, pose_turns_deg
-from colmap_affrect.mappers.own_cameras import one_camera, with_per_image_cameras
+from colmap_affrect.mappers.own_cameras import (
+    one_camera,
+    trial_with_own_cameras,
+    with_per_image_cameras,
+)
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.reliability import score_images
 from colmap_affrect.mappers.reliability_features import features_of
+from colmap_affrect.mappers.search import Search
+from colmap_affrect.mappers.some_tracks import SOME_TRACKS
 
 
 def task_of(path: Path, truth: pycolmap.Reconstruction) -> MappingTask:
@@ -166,3 +172,23 @@ def test_pairs_that_a_hypothesis_leaves_out_make_own_cameras_no_less_likely(
     found = with_per_image_cameras(per_image, some, shared, model)
     assert found.other is not None
     assert abs(found.other.log_odds) < 3.0
+
+
+def test_own_cameras_are_tried_once_while_a_model_gets_the_points_of_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = synthesize(tmp_path / "database.db", num_rigs=5, num_points3D=2500)
+    num_points = list[int]()
+
+    def trial(
+        per_image: Search, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        num_points.append(model.num_points3D())
+        return trial_with_own_cameras(per_image, graph, model)
+
+    monkeypatch.setattr(hypotheses, "trial_with_own_cameras", trial)
+    monkeypatch.setattr(own_cameras, "trial_with_own_cameras", None)
+    model = mapped(task_of(tmp_path / "database.db", truth), tmp_path)
+    assert SOME_TRACKS in model.hypotheses
+    (num_some,) = num_points
+    assert 0 < num_some < model.reconstruction.num_points3D() / 2

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import cv2
 import pytest
 
-from colmap_affrect.parallel.executor import map_ordered
+from colmap_affrect.colmap.database_verification import PAIRS_AHEAD
+from colmap_affrect.parallel.executor import Threads, map_ordered
 
 
 def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:
@@ -30,6 +31,18 @@ def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:
         results.append(result)
     assert results == [task * task for task in range(50)]
     assert sorted(started) == list(range(50))
+
+
+def test_a_thread_goes_on_while_another_has_a_long_task() -> None:
+    is_done = threading.Semaphore(0)
+
+    def work(task: int) -> bool:
+        if task:
+            is_done.release()
+            return True
+        return all(is_done.acquire(timeout=5.0) for _ in range(PAIRS_AHEAD))
+
+    assert all(Threads(2, PAIRS_AHEAD).map(work, range(40)))
 
 
 def test_threads_share_those_of_opencv() -> None:
