@@ -28,17 +28,13 @@ from colmap_affrect.escalation.policy import (
     EFFORTS,
     Plan,
     learned_step,
-    matched_by_level,
     next_step,
-    untried_by_level,
 )
-from colmap_affrect.options import EffortName
 from colmap_affrect.pairs.lists import Pair
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.image_failures import UnusableImageError
 from colmap_affrect.project.match_state import Begun, Worth
 from colmap_affrect.project.match_store import Learned, PairMatches
-from colmap_affrect.project.report import MatchedAgain
 from colmap_affrect.project.stage_report import StageReport
 from colmap_affrect.project.stage_warnings import StageWarning
 from colmap_affrect.recipes import EscalateOptions
@@ -82,35 +78,6 @@ def begin(context: Context, options: EscalateOptions | None = None) -> "Escalati
         escalation.write()
     escalation.add_to_report(time.perf_counter() - start, num_pairs=0)
     return escalation
-
-
-@dataclass(frozen=True)
-class EscalationSummary:
-    """What escalation did for a set, and what is left."""
-
-    effort: EffortName = "normal"  # how much was tried
-    matched_again: tuple[MatchedAgain, ...] = ()  # pairs by level
-    untried: tuple[MatchedAgain, ...] = ()  # what a greater effort would try
-
-
-def escalation_summary(context: Context) -> EscalationSummary:
-    """Return what escalation did in a workspace, and what is left for images to match again."""
-    workspace = context.workspace
-    if workspace.is_foreign or "escalate" not in workspace.started_stages:
-        return EscalationSummary()
-    escalation = Escalation(context, context.escalation)
-    image_set = escalation.image_set
-    models = image_set.models()
-    weights = image_set.weights(models)
-    if not (weights or escalation.has_begun):  # large sets take long to go through
-        return EscalationSummary()
-    situation = image_set.situation(weights, models)
-    effort = escalation.matches.state.effort or context.effort
-    return EscalationSummary(
-        effort=effort,
-        matched_again=tuple(matched_by_level(situation)),
-        untried=tuple(untried_by_level(situation)),
-    )
 
 
 @dataclass(frozen=True)
@@ -294,21 +261,32 @@ class Escalation:
             pairs: of image names.
             level: number of the level in the recipe.
         """
-        if pairs:
-            self._begin_step(Begun(level, tuple(pairs)))
+        if pairs and not self.matches.state.step:
+            self._begin_step(level, pairs)
         known = self._use_learned_matches(pairs, level)
         unknown = [pair for pair in pairs if pair not in known]
         self._match_with(unknown, level, self._keep)
         self.write()
-        self.matches.update_state(step=None)
+        self._end_step()
 
-    def _begin_step(self, step: Begun) -> None:
-        """Put a step on record, and whether mapping follows it alone; it may have begun before."""
+    def _begin_step(self, level: int, pairs: Sequence[Pair]) -> None:
+        """Put a step on record, and that learned matching was left out before it, if it was."""
         state = self.matches.state
-        rounds = state.rounds
-        if state.step is None and self.image_set.is_mapped():
+        step = Begun(level, tuple(pairs), follows_mapping=self.image_set.is_mapped())
+        unlearned_set = state.unlearned_set
+        if state.learned_matching is None and self.image_set.has_learned_level():
+            unlearned_set = self.context.set_digest()
+        self.matches.update_state(
+            step=step, has_stepped=True, unlearned_set=unlearned_set
+        )
+
+    def _end_step(self) -> None:
+        """Put on record that a step has ended, and whether mapping follows it."""
+        step = self.matches.state.step
+        rounds = self.matches.state.rounds
+        if step and step.follows_mapping and not self.image_set.is_mapped():
             rounds = (*rounds, step.level)
-        self.matches.update_state(step=step, rounds=rounds, has_stepped=True)
+        self.matches.update_state(step=None, rounds=rounds)
 
     def _use_learned_matches(self, pairs: Sequence[Pair], level: int) -> set[Pair]:
         """Use the learned matches of a level that are there already, where they are better.
@@ -344,14 +322,14 @@ class Escalation:
 
         Returns:
             Whether there are any; none of sets that are large or need nothing, where no learned
-            level can be used, and where no image was worth it when that was looked at first.
+            level can be used, and where the same set was gone on with without it before.
         """
         if self.matches.state.learned_matching:
             return True
         effort = self.context.effort
         present = self.context.set_digest()
-        was_declined = self.matches.state.not_worth_learning == present
-        if was_declined and EFFORTS[effort].gives_up:
+        was_left_out = self.matches.state.unlearned_set == present
+        if was_left_out and EFFORTS[effort].gives_up:
             return False
         models = self.image_set.models()
         weights = self.image_set.weights(models)
@@ -362,7 +340,7 @@ class Escalation:
             return False
         step = learned_step(situation, effort)
         if not step.pairs:
-            self.matches.update_state(not_worth_learning=present)
+            self.matches.update_state(unlearned_set=present)
             return False
         after = next_step(situation, effort)
         self.context.progress.expect(after.left_s / available_cores())

@@ -7,7 +7,12 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from colmap_affrect.colmap.connections import weakly_connected_images
-from colmap_affrect.escalation.expected_gain import PairState, insecure_images
+from colmap_affrect.escalation.expected_gain import (
+    LEARNED,
+    PairState,
+    insecure_images,
+    kind_of,
+)
 from colmap_affrect.escalation.policy import Situation
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import MIN_LARGE_SET
@@ -88,6 +93,14 @@ class ImageSet:
         return (
             self.context.workspace.model_inputs() == self.context.current_model_inputs()
         )
+
+    def has_learned_level(self) -> bool:
+        """Tell whether the recipe has a level of learned matching that can be used."""
+        extraction = self.context.extraction
+        for number in self.context.resources.usable_levels(extraction)[1:]:
+            if kind_of(extraction.levels[number]) == LEARNED:
+                return True
+        return False
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""

@@ -107,7 +107,7 @@ def _map_first(context: Context, mapper: Mapper, recipe: Recipe) -> list[StageRe
         return []
     remove_alternatives(context)  # of other pairs
     reports = [guide(context, recipe.guided), map_images(context, mapper)[0]]
-    matches.update_state(modelled=state.listed)
+    matches.update_state(modelled=state.listed, rounds=())
     return reports
 
 

@@ -3,8 +3,9 @@
 1. Learned matching of whole photographs comes first, where its weights are there: it helps where
    light, age or season differ. On small sets it matches the pairs of images that may gain what the
    time of their pairs is worth, beside what is there
-   (:mod:`colmap_affrect.escalation.alternatives`): the verified ones, then all others, unless it
-   ties these no better. On other sets as many pairs are matched as take what the first model took.
+   (:mod:`colmap_affrect.escalation.alternatives`): the verified ones first, and the others unless
+   it ties the verified ones no better. On other sets as many pairs are matched as take what the
+   first model took.
 2. Afterwards the level and the pairs come that are likely to save most photographs per second
    (:mod:`colmap_affrect.escalation.expected_gain`), until the budget of the effort is spent, or
    nothing is likely to help. Levels that were in vain are given up, except with high effort.
@@ -89,7 +90,7 @@ EFFORTS: Mapping[EffortName, Effort] = {
 }
 
 
-# The least that a second must bring: as it is for all of the budget
+# Photographs that a second must bring at least: as many as one of the whole budget
 PHOTOGRAPHS_PER_S = MIN_PHOTOGRAPHS / EFFORTS["normal"].least_s
 
 
@@ -102,7 +103,7 @@ class Situation:
         usable: numbers of the levels of escalation that may be tried.
         states: of all pairs.
         weights: of the images to match again, in photographs.
-        gains: what matches may bring to each of these, also where it is likely right.
+        gains: what matches may bring to each of these, not less where an image is likely right.
         weakly_connected: images with few features in tracks through three.
         anchored: images of the model that measured frames connect to a likely one.
         megapixels: of each image, by level.

@@ -262,7 +262,7 @@ class HypothesisTest:
         """Return a model with a camera for each image, made from some of the tracks at least."""
         if self.tried and self.tried[0] is model:
             return self.tried[1].trial
-        return trial_with_own_cameras(own, own.graph, model)
+        return trial_with_own_cameras(own, own.graph.thinned(), model)
 
     def _begin_trial_with_own_cameras(
         self, hypothesis: _Hypothesis, model: pycolmap.Reconstruction
@@ -270,9 +270,10 @@ class HypothesisTest:
         """Try a model with a camera for each image, in a thread, while it gets all points."""
         if self.per_image:
             graph = self.per_image.graph.without(hypothesis.left_out)
+            thin = graph.thinned()
             copied = pycolmap.Reconstruction(model)
             self.begun = begin_in_thread(
-                partial(trial_with_own_cameras, self.per_image, graph, copied)
+                partial(trial_with_own_cameras, self.per_image, thin, copied)
             )
 
     def _take_shifted_axes(self, free: Search) -> bool:

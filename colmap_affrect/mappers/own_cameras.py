@@ -84,10 +84,16 @@ def one_camera(
 
 
 def trial_with_own_cameras(
-    per_image: Search, graph: PairGraph, model: pycolmap.Reconstruction
+    per_image: Search, thin: PairGraph, model: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction:
-    """Return a model with a camera for each image, from some of the tracks; the other one stays."""
-    return per_image.comparing().grower(graph.thinned()).restart_from(model)
+    """Return a model with a camera for each image, made from some of the tracks.
+
+    Args:
+        per_image: Makes the model.
+        thin: A graph of these tracks.
+        model: Has the poses and cameras to begin with; it stays as it is.
+    """
+    return per_image.comparing().grower(thin).restart_from(model)
 
 
 def with_per_image_cameras(
@@ -104,13 +110,14 @@ def with_per_image_cameras(
         graph: Its pairs.
         shared: Scores the model with shared cameras.
         model: The model with shared cameras; it stays as it is.
-        known: What :func:`trial_with_own_cameras` made of it, if it did; it may be changed.
+        known: What :func:`trial_with_own_cameras` made of it, perhaps before it got all points; it
+            may be changed.
     """
     is_looked_at = model.num_reg_images() <= MAX_OPEN_IMAGES
     thin = graph.thinned()
     if thin is not graph:
         grower = per_image.comparing().grower(thin)
-        trial = known or trial_with_own_cameras(per_image, graph, model)
+        trial = known or trial_with_own_cameras(per_image, thin, model)
         scorer = replace(per_image.scorer, graph=thin)
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if scorer.score(trial) <= shared_score + MIN_SCORE_GAIN:

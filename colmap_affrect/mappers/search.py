@@ -160,12 +160,14 @@ class Search:
         if not self.builds_bridges:
             return with_new_images(models)
         grower = self.grower(graph)
-        bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
-        joined = map_ordered(
-            lambda mapped: register_bridges(mapped, bridges, grower, self.scorer),
-            models[: self.num_bridged_models],
-            available_cores(),
-        )
+
+        def with_own_bridges(mapped: MappedModel) -> MappedModel:
+            # What a finder keeps is of the cameras that asked first
+            bridges = BridgeFinder(graph, self.adjuster, self.native.random_seed)
+            return register_bridges(mapped, bridges, grower, self.scorer)
+
+        first_models = models[: self.num_bridged_models]
+        joined = map_ordered(with_own_bridges, first_models, available_cores())
         return with_new_images([max(joined, key=self._score), *models])
 
     def is_certain(

@@ -146,7 +146,7 @@ def map_ordered(
     num_threads: int,
     num_ahead: int = 0,
 ) -> Generator[Result, None, None]:
-    """Yield the results of tasks in their order; at most two tasks per thread are in flight.
+    """Yield the results of tasks in their order; few tasks are in flight, two per thread at least.
 
     Meanwhile numpy's linear algebra keeps to the calling thread, and OpenCV to its share of the
     cores: thread pools of their own in every task would only wait for each other. Work that has not

@@ -27,13 +27,14 @@ class Begun:
 
     level: int
     pairs: tuple[Names, ...]
+    follows_mapping: bool = False  # all that was verified before was mapped
 
 
 @dataclass(frozen=True)
 class LearnedModels:
     """What models of learned matches are worth."""
 
-    of_set: str  # its digest
+    of_set: str  # digest of the set that they are of
     score: float  # 0 where there are none
     score_without: float  # of the first models
     is_of_most: bool = False  # most poses are expected to be right in one of them
@@ -75,14 +76,14 @@ class MatchState:
     """What learned matching is for, whose matches are kept beside those in use."""
     learned_models: LearnedModels | None = None
     """What models of these matches are worth."""
-    not_worth_learning: str = ""
-    """Digest of the set of which no photograph was worth learned matching, before any step."""
+    unlearned_set: str = ""
+    """Digest of the set that was gone on with without learned matching, though it was possible."""
     step: Begun | None = None
     """The step of escalation that has begun and not ended."""
     has_stepped: bool = False
     """Whether any step has begun."""
     rounds: tuple[int, ...] = ()
-    """Levels of the steps that began when all was mapped: mapping follows each of them."""
+    """Levels of the steps that mapping follows, since the first model."""
     follows: str = ""
     """Folder of better models whose matches these are already, while ``sparse/`` has others."""
 

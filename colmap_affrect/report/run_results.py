@@ -6,7 +6,7 @@ from typing import Any
 
 from colmap_affrect.colmap.by_hand import Marks
 from colmap_affrect.colmap.database import num_matched_pairs
-from colmap_affrect.escalation.escalate import escalation_summary
+from colmap_affrect.escalation.summary import escalation_summary
 from colmap_affrect.geometry.lines import LineFindings
 from colmap_affrect.mappers.base import MapperOptions
 from colmap_affrect.pairs.lists import Pair

@@ -35,8 +35,9 @@ from colmap_affrect.escalation.alternatives import (
     remove_alternatives,
     restore_best,
 )
-from colmap_affrect.escalation.escalate import Escalation, begin, escalation_summary
+from colmap_affrect.escalation.escalate import Escalation, begin
 from colmap_affrect.escalation.image_set import ImageSet
+from colmap_affrect.escalation.summary import escalation_summary
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.mapping import read_summaries
@@ -455,11 +456,19 @@ def test_weights_that_are_installed_after_steps_bring_learned_matching(
     with monkeypatch.context() as patch:
         patch.setattr(Resources, "usable_levels", lambda *_: [0])
         assert not escalation.plan_learned_matching()
-        context.matches.update_state(has_stepped=True, rounds=(2,))
+        escalation.match_at(list(escalation.image_set.pairs)[:1], 1)
     assert escalation.plan_learned_matching()
 
 
-def test_learned_matching_that_was_of_no_worth_before_any_step_is_of_none_later(
+def test_steps_that_were_taken_without_learned_matching_go_on_without_it(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = without_learned_matches(context, monkeypatch)
+    escalation.match_at(list(escalation.image_set.pairs)[:1], 1)
+    assert not escalation.plan_learned_matching()
+
+
+def test_learned_matching_that_a_set_was_gone_on_without_is_left_out_later_too(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise a run that was killed would decide otherwise than one that goes through."""

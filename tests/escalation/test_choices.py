@@ -465,6 +465,22 @@ def test_steps_cost_nothing_while_models_are_worse_than_the_best_ones(
     assert found == [True, False, True]
 
 
+def test_rounds_are_counted_from_the_first_model_of_a_list_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of photographs that were added since, each takes more."""
+    context = context_in(tmp_path)
+    changes = dict[str, Any]()
+    state = MatchState(listed="more pairs", modelled="pairs", rounds=(1, 2))
+    context.matches = SimpleNamespace(state=state, update_state=changes.update)
+    monkeypatch.setattr(map_and_rematch, "guide", lambda *_: None)
+    monkeypatch.setattr(map_and_rematch, "map_images", lambda *_: [None])
+    recipe: Any = SimpleNamespace(guided=None)
+    mapper: Any = None
+    map_and_rematch._map_first(context, mapper, recipe)
+    assert changes == {"modelled": "more pairs", "rounds": ()}
+
+
 def test_learned_models_that_were_given_up_are_needed_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

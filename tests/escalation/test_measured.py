@@ -121,12 +121,20 @@ def test_pairs_that_nothing_hints_at_escalate_to_features_of_another_kind(
     # The matches that are stored look different now; what is left of the step is not decided anew.
     escalation = Escalation(context, options)
     assert escalation.next_step() == Step(1, own[2:])
-    with monkeypatch.context() as patch:
-        patch.setattr(ImageSet, "is_mapped", lambda _: True)
-        escalation.match_at(own[2:], 1)
+    escalation.match_at(own[2:], 1)
     assert escalation.matches.state.rounds == (1,)  # it is one step
     assert min(escalation.image_set.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_step() is None
+
+
+def test_no_mapping_follows_a_step_that_changes_nothing(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    escalation = escalation_of(context)
+    monkeypatch.setattr(ImageSet, "is_mapped", lambda _: True)
+    escalation.match_at(without_matches(context, NAMES[3]), 1)
+    assert escalation.matches.state.has_stepped
+    assert not escalation.matches.state.rounds
 
 
 @pytest.mark.long

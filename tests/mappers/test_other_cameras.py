@@ -181,10 +181,10 @@ def test_own_cameras_are_tried_once_while_a_model_gets_the_points_of_all(
     num_points = list[int]()
 
     def trial(
-        per_image: Search, graph: PairGraph, model: pycolmap.Reconstruction
+        per_image: Search, thin: PairGraph, model: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
         num_points.append(model.num_points3D())
-        return trial_with_own_cameras(per_image, graph, model)
+        return trial_with_own_cameras(per_image, thin, model)
 
     monkeypatch.setattr(hypotheses, "trial_with_own_cameras", trial)
     monkeypatch.setattr(own_cameras, "trial_with_own_cameras", None)

@@ -23,6 +23,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_verification import verify
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.mappers import adjustment
+from colmap_affrect.mappers import search as mappers_search
 from colmap_affrect.mappers.adjustment import FINAL, Adjuster
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import BridgeFinder
@@ -413,6 +414,23 @@ def test_a_search_without_bridges_keeps_models_of_other_images(
         models.append(MappedModel(part))
     search = unknown_search(scene, Search, builds_bridges=False)
     assert search.with_bridges(search.graph, models) == models[:2]
+
+
+def test_each_model_has_bridges_of_its_own_cameras(
+    scene: Scene, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Relative poses that are kept for another model may be of other focal lengths."""
+    finders = list[BridgeFinder]()
+
+    def register(mapped: MappedModel, bridges: BridgeFinder, *_: Any) -> MappedModel:
+        finders.append(bridges)
+        return mapped
+
+    monkeypatch.setattr(mappers_search, "register_bridges", register)
+    search = unknown_search(scene, Search)
+    models = [MappedModel(without_last(model)), MappedModel(without_last(model))]
+    search.with_bridges(search.graph, models)
+    assert len({id(finder) for finder in finders}) == 2
 
 
 def test_a_search_ends_after_as_many_failing_first_pairs_as_colmaps(

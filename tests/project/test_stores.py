@@ -336,13 +336,13 @@ def test_state_of_matches_is_kept_with_them_and_forgotten_where_pairs_go(
     matches.update_state(
         step=Begun(1, pairs),
         rounds=(2, 1),
-        not_worth_learning="set",
+        unlearned_set="set",
         learned_models=learned_models,
         in_vain=("a", True),
     )
     assert matches.state == MatchState(
         "digest", ("a", True), stationary, effort="high", learned_models=learned_models,
-        not_worth_learning="set", step=Begun(1, pairs), rounds=(2, 1),
+        unlearned_set="set", step=Begun(1, pairs), rounds=(2, 1),
     )  # fmt: skip
     matches.remove(pairs=pairs[:1])
     assert matches.state == MatchState(stationary=stationary, effort="high")
