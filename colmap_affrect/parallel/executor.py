@@ -119,7 +119,7 @@ def one_openmp_thread() -> Iterator[None]:
         yield
 
 
-def begin_in_thread(call: Callable[[], Result]) -> "Future[Result]":
+def begin_in_thread(call: Callable[[], Result]) -> Future[Result]:
     """Begin a call in a thread of its own, which does not keep a program from ending.
 
     Args:
