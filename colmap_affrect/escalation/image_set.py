@@ -7,13 +7,8 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from colmap_affrect.colmap.connections import weakly_connected_images
-from colmap_affrect.escalation.expected_gain import (
-    LEARNED,
-    PairState,
-    insecure_images,
-    kind_of,
-)
-from colmap_affrect.escalation.policy import Situation
+from colmap_affrect.escalation.expected_gain import PairState, insecure_images
+from colmap_affrect.escalation.policy import Situation, learned_level_of
 from colmap_affrect.mappers.mapping import read_summaries
 from colmap_affrect.mappers.sparse import MIN_LARGE_SET
 from colmap_affrect.mappers.wrong_models import read_thrown_away
@@ -96,11 +91,12 @@ class ImageSet:
 
     def has_learned_level(self) -> bool:
         """Tell whether the recipe has a level of learned matching that can be used."""
-        extraction = self.context.extraction
-        for number in self.context.resources.usable_levels(extraction)[1:]:
-            if kind_of(extraction.levels[number]) == LEARNED:
-                return True
-        return False
+        levels = self.context.extraction.levels
+        return learned_level_of(levels, self._usable_levels()) is not None
+
+    def _usable_levels(self) -> list[int]:
+        """Return the numbers of the levels of escalation whose weights are there."""
+        return self.context.resources.usable_levels(self.context.extraction)[1:]
 
     def _insecure(self, wanted: set[str], *, num_images: int) -> set[str]:
         """Return the images that the next model may well lose; none where it will tell of them."""
@@ -194,7 +190,7 @@ class ImageSet:
         states = self.states()
         return Situation(
             levels=extraction.levels,
-            usable=self.context.resources.usable_levels(extraction)[1:],
+            usable=self._usable_levels(),
             states=states,
             weights=weights,
             gains=_gains(weights, models),

@@ -18,7 +18,7 @@ as any other.
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from colmap_affrect.escalation.expected_gain import (
@@ -94,6 +94,22 @@ EFFORTS: Mapping[EffortName, Effort] = {
 PHOTOGRAPHS_PER_S = MIN_PHOTOGRAPHS / EFFORTS["normal"].least_s
 
 
+def learned_level_of(levels: Sequence[Level], usable: Iterable[int]) -> int | None:
+    """Return the number of the level that matches whole photographs by networks.
+
+    Args:
+        levels: of the recipe.
+        usable: numbers of the levels of escalation that may be tried.
+
+    Returns:
+        The number; None where no such level can be used.
+    """
+    for number in usable:
+        if kind_of(levels[number]) == LEARNED:
+            return number
+    return None
+
+
 @dataclass(frozen=True)
 class Situation:
     """What is known of a set of images, as escalation sees it.
@@ -134,10 +150,7 @@ class Situation:
     @property
     def learned_level(self) -> int | None:
         """Number of the level that matches whole photographs by networks, if it can be used."""
-        for number in self.usable:
-            if kind_of(self.levels[number]) == LEARNED:
-                return number
-        return None
+        return learned_level_of(self.levels, self.usable)
 
     def is_measured(self, number: int) -> bool:
         """Tell whether the frames of a level are measured one by one."""
@@ -336,10 +349,10 @@ def forecast_of(
         megapixels: of all photographs, at the size of processing.
         is_new: whether the run begins.
     """
+    escalating = [number for number in usable if number > 0]
     num_learned = 0  # of a larger set learned matching takes no longer than the rest
-    for number in usable:
-        if kind_of(levels[number]) == LEARNED and number > 0 and num_images <= SMALL:
-            num_learned = num_pairs
+    if num_images <= SMALL and learned_level_of(levels, escalating) is not None:
+        num_learned = num_pairs
     return Forecast(
         num_images,
         num_pairs,

@@ -116,14 +116,13 @@ def with_per_image_cameras(
     is_looked_at = model.num_reg_images() <= MAX_OPEN_IMAGES
     thin = graph.thinned()
     if thin is not graph:
-        grower = per_image.comparing().grower(thin)
         trial = known or trial_with_own_cameras(per_image, thin, model)
         scorer = replace(per_image.scorer, graph=thin)
         shared_score = replace(shared.scorer, graph=thin).score(model)
         if scorer.score(trial) <= shared_score + MIN_SCORE_GAIN:
             if not is_looked_at:
                 return OwnCameras(None, None, trial)
-            grower.adjust_fully(trial)
+            per_image.comparing().grower(thin).adjust_fully(trial)
             other = _compared(model, trial, shared, scorer)
             return OwnCameras(None, other, trial)
     whole = per_image.grower(graph).remake(model)

@@ -414,29 +414,6 @@ def test_images_that_are_left_out_need_nothing_and_are_no_lack(
     assert learned_models.is_of_most
 
 
-def test_learning_that_was_killed_goes_on_with_the_same_pairs(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Images may have got features: what is needed would look different."""
-    escalation = escalation_of(context)
-    pairs = list(escalation.image_set.pairs)
-    context.matches.update_state(learned_matching=None)
-    monkeypatch.setattr(ImageSet, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
-    assert not escalation.plan_learned_matching()  # all have learned matches
-    context.matches.remove(pairs=pairs)
-    match(context)
-    escalation.write()
-    assert escalation.plan_learned_matching()
-    monkeypatch.setattr(ImageSet, "weights", lambda *_: {})
-    assert escalation.plan_learned_matching()
-    assert not escalation.has_all_learned_matches
-    monkeypatch.setattr(Escalation, "is_over_time", True)
-    assert escalation.match_learned() == 0
-    monkeypatch.setattr(Escalation, "is_over_time", False)
-    assert escalation.match_learned() == len(pairs)
-    assert escalation.has_all_learned_matches
-
-
 def without_learned_matches(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> Escalation:
@@ -447,6 +424,27 @@ def without_learned_matches(
     match(context)
     escalation.write()
     return escalation
+
+
+def test_learning_that_was_killed_goes_on_with_the_same_pairs(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images may have got features: what is needed would look different."""
+    escalation = escalation_of(context)
+    pairs = list(escalation.image_set.pairs)
+    context.matches.update_state(learned_matching=None)
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: dict.fromkeys(NAMES, 1.0))
+    assert not escalation.plan_learned_matching()  # all have learned matches
+    escalation = without_learned_matches(context, monkeypatch)
+    assert escalation.plan_learned_matching()
+    monkeypatch.setattr(ImageSet, "weights", lambda *_: {})
+    assert escalation.plan_learned_matching()
+    assert not escalation.has_all_learned_matches
+    monkeypatch.setattr(Escalation, "is_over_time", True)
+    assert escalation.match_learned() == 0
+    monkeypatch.setattr(Escalation, "is_over_time", False)
+    assert escalation.match_learned() == len(pairs)
+    assert escalation.has_all_learned_matches
 
 
 def test_weights_that_are_installed_after_steps_bring_learned_matching(
